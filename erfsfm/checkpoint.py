@@ -20,7 +20,14 @@ from erfsfm.common.config_tree import dump_yaml
 from erfsfm.common.errors import CheckpointError, ConfigError, ErfsfmError
 from erfsfm.common.files import write_atomically
 from erfsfm.config import NetworkConfig, NetworkKind
-from erfsfm.model_record import KINDS, ModelRecord, find_weights, read_record, read_tensors, tensors_file
+from erfsfm.model_record import (
+    KINDS,
+    ModelRecord,
+    find_weights,
+    read_record,
+    read_tensors,
+    tensors_file,
+)
 from erfsfm.networks.presets import PRESETS, build
 
 
@@ -45,7 +52,10 @@ def build_networks(config: NetworkConfig) -> dict[NetworkKind, nn.Module]:
             raise ConfigError(f"network.{kind} must be a {kind} network ({known}); got '{name}'")
     rest = config.sources, config.normalisation, config.activation
     widths = config.depth_width, config.pose_width
-    return {kind: build(name, config.fidelity, width, *rest) for kind, name, width in zip(KINDS, presets, widths)}
+    return {
+        kind: build(name, config.fidelity, width, *rest)
+        for kind, name, width in zip(KINDS, presets, widths)
+    }
 
 
 def save_model(folder: Path, model: Model, half: bool = False) -> None:
@@ -58,7 +68,9 @@ def save_model(folder: Path, model: Model, half: bool = False) -> None:
     """
     for kind, net in model.networks.items():
         # through memory: errors of a full disk come from the library as an exception of its own
-        tensors = {key: value.detach().cpu().contiguous() for key, value in net.state_dict().items()}
+        tensors = {
+            key: value.detach().cpu().contiguous() for key, value in net.state_dict().items()
+        }
         for key, value in tensors.items() if half else ():
             if value.is_floating_point() and "running_" not in key:
                 tensors[key] = value.half()
@@ -77,14 +89,18 @@ def load_model(name_or_folder: str | Path) -> Model:
     try:
         networks = build_networks(record.network)
     except ConfigError as error:
-        raise CheckpointError(f"{folder / 'model.yaml'} names networks that cannot be built: {error}") from error
+        raise CheckpointError(
+            f"{folder / 'model.yaml'} names networks that cannot be built: {error}"
+        ) from error
     for kind in record.kinds:
         tensors = {key: torch.tensor(value) for key, value in read_tensors(folder, kind).items()}
         fill_network(networks[kind].eval(), tensors, tensors_file(folder, kind), "model.yaml says")
     return Model(record, {kind: networks[kind] for kind in record.kinds})
 
 
-def fill_network(net: nn.Module, tensors: dict[str, torch.Tensor], origin: Path, wanted_by: str) -> None:
+def fill_network(
+    net: nn.Module, tensors: dict[str, torch.Tensor], origin: Path, wanted_by: str
+) -> None:
     """Put weights into a network, all of them or none.
 
     Args:
@@ -98,10 +114,14 @@ def fill_network(net: nn.Module, tensors: dict[str, torch.Tensor], origin: Path,
     """
     wanted = net.state_dict()
     if strange := sorted(wanted.keys() ^ tensors.keys()):
-        raise CheckpointError(f"{origin} is of another architecture than {wanted_by}: first '{strange[0]}'")
+        raise CheckpointError(
+            f"{origin} is of another architecture than {wanted_by}: first '{strange[0]}'"
+        )
     for key, value in tensors.items():
         if value.shape != wanted[key].shape:
-            raise CheckpointError(f"{origin}: '{key}' has another shape than {wanted_by}: {tuple(value.shape)}")
+            raise CheckpointError(
+                f"{origin}: '{key}' has another shape than {wanted_by}: {tuple(value.shape)}"
+            )
     net.load_state_dict({key: value.to(wanted[key].dtype) for key, value in tensors.items()})
 
 
@@ -139,7 +159,9 @@ def take_over(network: nn.Module, trained: dict[str, torch.Tensor]) -> None:
     known = set(trained)
     for key, fresh in filled.items():
         source = key
-        if key not in trained and key.endswith(".weight"):  # the other network has it deformable, or plain
+        if key not in trained and key.endswith(
+            ".weight"
+        ):  # the other network has it deformable, or plain
             stem = key.removesuffix("weight").removesuffix("kernel.")
             source = f"{stem}weight" if key.endswith(".kernel.weight") else f"{stem}kernel.weight"
         if source in trained:

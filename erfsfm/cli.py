@@ -21,7 +21,9 @@ from erfsfm.common.table import Table, table_of
 
 logger = logging.getLogger(__name__)
 
-app = command_line.application("erfsfm", "Self-supervised depth and ego-motion networks with wide receptive fields.")
+app = command_line.application(
+    "erfsfm", "Self-supervised depth and ego-motion networks with wide receptive fields."
+)
 evaluate_app = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Depth and pose errors of trained networks."
 )
@@ -29,23 +31,38 @@ app.add_typer(evaluate_app, name="evaluate")
 
 Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="where to compute")]
 Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of the random numbers")]
-UnusedSeed = Annotated[int, typer.Option("--seed", hidden=True, help="accepted for old scripts; nothing is random")]
-Weights = Annotated[str, typer.Option(help="a shipped name (default, sim) or a training output folder")]
+UnusedSeed = Annotated[
+    int, typer.Option("--seed", hidden=True, help="accepted for old scripts; nothing is random")
+]
+Weights = Annotated[
+    str, typer.Option(help="a shipped name (default, sim) or a training output folder")
+]
 ManyWeights = Annotated[
-    list[str], typer.Option(help="a shipped name (default, sim) or a training output folder; repeat to compare")
+    list[str],
+    typer.Option(
+        help="a shipped name (default, sim) or a training output folder; repeat to compare"
+    ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
-Fidelity = Annotated[Literal["default", "paper"], typer.Option(help="paper: exactly as the reference code")]
+Fidelity = Annotated[
+    Literal["default", "paper"], typer.Option(help="paper: exactly as the reference code")
+]
 
 
 @app.command()
 def train(
-    config: Annotated[str, typer.Option(help="a YAML file, or the name of a shipped configuration")],
+    config: Annotated[
+        str, typer.Option(help="a YAML file, or the name of a shipped configuration")
+    ],
     dataset: Annotated[
         list[Path] | None,
-        typer.Option(help="KITTI odometry or raw root, image folder, video or prepared folder; repeat"),
+        typer.Option(
+            help="KITTI odometry or raw root, image folder, video or prepared folder; repeat"
+        ),
     ] = None,
-    output: Annotated[Path, typer.Option(help="receives weights, checkpoints and logs")] = Path("runs/train"),
+    output: Annotated[Path, typer.Option(help="receives weights, checkpoints and logs")] = Path(
+        "runs/train"
+    ),
     prepare: Annotated[
         Path | None,
         typer.Option(
@@ -53,8 +70,12 @@ def train(
             "--dataset for the same training elsewhere"
         ),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="resume from the last checkpoint in OUTPUT")] = False,
-    overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="resume from the last checkpoint in OUTPUT")
+    ] = False,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", help="section.key=value; repeat")
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="overrides training.seed")] = None,
     device: Device = "auto",
 ) -> None:
@@ -106,7 +127,9 @@ def _how_good(folder: Path) -> str:
     ]
     kind, data = ("pose", "KITTI --sequence 09") if record.networks == "pose" else ("depth", "ROOT")
     said = f"validation: {', '.join(measured)}" if measured else "they were not validated"
-    return f"{said}; errors on other data: erfsfm evaluate {kind} --weights {folder} --dataset {data}"
+    return (
+        f"{said}; errors on other data: erfsfm evaluate {kind} --weights {folder} --dataset {data}"
+    )
 
 
 @app.command("train-fusion")
@@ -115,7 +138,9 @@ def train_fusion(
     validation: Annotated[list[Path], typer.Option(help="such a world, not trained on; repeat")],
     output: Annotated[Path, typer.Option(help="receives fusion.onnx")] = Path("runs/fusion"),
     weights: Weights = "default",
-    samples: Annotated[int, typer.Option(min=8, help="to draw; a thousand takes 0.7 GB of memory")] = 4000,
+    samples: Annotated[
+        int, typer.Option(min=8, help="to draw; a thousand takes 0.7 GB of memory")
+    ] = 4000,
     steps: Annotated[int, typer.Option(min=1, help="of optimisation")] = 6000,
     seed: Seed = 0,
     as_json: Json = False,
@@ -127,7 +152,9 @@ def train_fusion(
     from erfsfm.training.fusion import train_fusion as run_training
 
     with progress_bar() as progress:
-        metrics = run_training(dataset, validation, output, weights, samples, steps, seed, _command(), progress)
+        metrics = run_training(
+            dataset, validation, output, weights, samples, steps, seed, _command(), progress
+        )
     print_rows([metrics], as_json)
     if not as_json:
         typer.echo(f"network in {output}: use it with --set depth.fusion={output}")
@@ -136,29 +163,43 @@ def train_fusion(
 @evaluate_app.command("depth")
 def evaluate_depth(
     dataset: Annotated[
-        list[Path], typer.Option(help="a root with depth_2, KITTI raw, or a folder of images/ and truth/; repeat")
+        list[Path],
+        typer.Option(
+            help="a root with depth_2, KITTI raw, or a folder of images/ and truth/; repeat"
+        ),
     ],
     weights: ManyWeights = ["default"],  # noqa: B006
     truth: Annotated[
         Literal["measured", "many-views"],
-        typer.Option(help="many-views: measured by optical flow at the poses of a run, for drives without true depth"),
+        typer.Option(
+            help="many-views: measured by optical flow at the poses of a run, for drives without true depth"
+        ),
     ] = "measured",
     sequence: Annotated[
-        list[str] | None, typer.Option(help="with many-views: recordings, or frames of one: 00[250:300]; repeat")
+        list[str] | None,
+        typer.Option(help="with many-views: recordings, or frames of one: 00[250:300]; repeat"),
     ] = None,
     cache: Annotated[
-        Path | None, typer.Option(help="with many-views: folder that keeps poses and depth for the next time")
+        Path | None,
+        typer.Option(help="with many-views: folder that keeps poses and depth for the next time"),
     ] = None,
     split: Annotated[
         str | None,
-        typer.Option(help="frames of KITTI raw: eigen, a YAML split, or a file of lines 'drive frame' or image paths"),
+        typer.Option(
+            help="frames of KITTI raw: eigen, a YAML split, or a file of lines 'drive frame' or image paths"
+        ),
     ] = None,
     fidelity: Fidelity = "default",
-    allow_leak: Annotated[bool, typer.Option("--allow-leak", help="evaluate frames seen in training")] = False,
+    allow_leak: Annotated[
+        bool, typer.Option("--allow-leak", help="evaluate frames seen in training")
+    ] = False,
     pictures: Annotated[
-        Path | None, typer.Option(help="folder that receives a picture of each street: image, depths and truth")
+        Path | None,
+        typer.Option(help="folder that receives a picture of each street: image, depths and truth"),
     ] = None,
-    output: Annotated[Path | None, typer.Option(help="a file that receives the JSON as well")] = None,
+    output: Annotated[
+        Path | None, typer.Option(help="a file that receives the JSON as well")
+    ] = None,
     device: Device = "auto",
     seed: UnusedSeed = 0,
     as_json: Json = False,
@@ -176,18 +217,28 @@ def evaluate_depth(
     from erfsfm.inference import DepthPosePredictor
 
     if truth == "many-views" and split is not None:
-        raise ConfigError("--truth many-views measures depth itself: leave --split out, name frames with --sequence")
+        raise ConfigError(
+            "--truth many-views measures depth itself: leave --split out, name frames with --sequence"
+        )
     if truth == "measured" and (sequence or cache):
         raise ConfigError("--sequence and --cache belong to --truth many-views")
     if fidelity == "paper" and split is None:
         raise ConfigError("--fidelity paper needs --split eigen or a file of frames of KITTI raw")
-    if (max(len(dataset), len(weights)) > 1 or pictures) and (truth == "many-views" or split is not None):
-        raise ConfigError("--split and --truth many-views take one --dataset, one --weights, and no --pictures")
+    if (max(len(dataset), len(weights)) > 1 or pictures) and (
+        truth == "many-views" or split is not None
+    ):
+        raise ConfigError(
+            "--split and --truth many-views take one --dataset, one --weights, and no --pictures"
+        )
     names = weights if len(weights) > 1 else ["networks"]
-    networks = {name: DepthPosePredictor.from_weights(each, device) for name, each in zip(names, weights)}
+    networks = {
+        name: DepthPosePredictor.from_weights(each, device) for name, each in zip(names, weights)
+    }
     with progress_bar() as show:
         if truth == "many-views":
-            parts = [part for name in sequence or [""] for part in named_recordings(dataset[0], name)]
+            parts = [
+                part for name in sequence or [""] for part in named_recordings(dataset[0], name)
+            ]
             rows = many_view_protocol(networks["networks"], parts, cache, allow_leak, show)
         elif split is None:
             rows = depth_protocol(networks, dataset, allow_leak, show, pictures)
@@ -215,7 +266,9 @@ def _narrow(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         head = {"street": row.get("street", "mean"), "weights": row["method"]}
         errors = {"abs_rel": row["abs_rel"], "se": row["abs_rel_se"]}
         if compares:
-            shown.append(head | errors | {"ratio": row.get("ratio"), "ratio se": row.get("ratio_se")})
+            shown.append(
+                head | errors | {"ratio": row.get("ratio"), "ratio se": row.get("ratio_se")}
+            )
         else:
             errors |= {key: row[key] for key in ("rmse", "a1", "images", "leak")}
             shown.append({"method": row.get("street", row["method"])} | errors)
@@ -225,10 +278,14 @@ def _narrow(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 @evaluate_app.command("pose")
 def evaluate_pose(
     dataset: Annotated[Path, typer.Option(help="a KITTI odometry root with poses")],
-    sequence: Annotated[list[str], typer.Option(help="sequence names, or frames of one: 00[250:300]; repeat")],
+    sequence: Annotated[
+        list[str], typer.Option(help="sequence names, or frames of one: 00[250:300]; repeat")
+    ],
     weights: Weights = "default",
     fidelity: Fidelity = "default",
-    allow_leak: Annotated[bool, typer.Option("--allow-leak", help="evaluate frames seen in training")] = False,
+    allow_leak: Annotated[
+        bool, typer.Option("--allow-leak", help="evaluate frames seen in training")
+    ] = False,
     device: Device = "auto",
     seed: UnusedSeed = 0,
     as_json: Json = False,
@@ -248,7 +305,9 @@ def evaluate_pose(
 def predict(
     images: Annotated[Path, typer.Argument(help="an image, or a folder of images")],
     weights: Weights = "default",
-    output: Annotated[Path, typer.Option(help="receives one .npy and one .png a frame")] = Path("depth"),
+    output: Annotated[Path, typer.Option(help="receives one .npy and one .png a frame")] = Path(
+        "depth"
+    ),
     device: Device = "auto",
     seed: UnusedSeed = 0,
 ) -> None:
@@ -269,12 +328,16 @@ def predict(
     if not files:
         raise DataError(f"{images} holds no png or jpg to predict from")
     if output.resolve() in {file.parent.resolve() for file in files}:
-        raise DataError(f"{output} holds the images themselves: choose another --output, or they would be overwritten")
+        raise DataError(
+            f"{output} holds the images themselves: choose another --output, or they would be overwritten"
+        )
     for file in files:
         depth_file = output / f"{file.stem}.npy"
         found = [path for path in (depth_file, depth_file.with_suffix(".png")) if path.exists()]
         if len(found) == 1:
-            raise DataError(f"{found[0]} is no earlier prediction and would be replaced: choose another --output")
+            raise DataError(
+                f"{found[0]} is no earlier prediction and would be replaced: choose another --output"
+            )
     predictor = DepthPosePredictor.from_weights(weights, device)
     unreadable = []
     for file in files:
@@ -297,7 +360,9 @@ def predict(
 def networks(
     fidelity: Fidelity = "default",
     width: Annotated[float, typer.Option(help="multiplies the channels")] = 1.0,
-    sources: Annotated[int, typer.Option(min=1, max=8, help="source frames of the pose networks")] = 4,
+    sources: Annotated[
+        int, typer.Option(min=1, max=8, help="source frames of the pose networks")
+    ] = 4,
     as_json: Json = False,
 ) -> None:
     """Every network: parameters, multiply-adds at 416x128, receptive field.
@@ -312,7 +377,11 @@ def networks(
         return
     rows = []
     for row in summaries:
-        work = f"{row['multiply_adds'] / 1e9:.2f} G" if row["multiply_adds"] is not None else "impossible"
+        work = (
+            f"{row['multiply_adds'] / 1e9:.2f} G"
+            if row["multiply_adds"] is not None
+            else "impossible"
+        )
         rows.append([row["name"], f"{row['parameters']:,}", work, f"{row['receptive_field']} px"])
     Table(["network", "parameters", "multiply-adds", "receptive field"], rows).print()
 
@@ -320,13 +389,20 @@ def networks(
 @app.command("receptive-field")
 def receptive_field(
     network: Annotated[list[str] | None, typer.Option(help="preset; repeat; default: all")] = None,
-    output: Annotated[Path, typer.Option(help="the figure: png, pdf or svg")] = Path("receptive-field.png"),
+    output: Annotated[Path, typer.Option(help="the figure: png, pdf or svg")] = Path(
+        "receptive-field.png"
+    ),
     images: Annotated[
-        Path | None, typer.Option(help="a folder, first five images used; default: a synthetic street")
+        Path | None,
+        typer.Option(help="a folder, first five images used; default: a synthetic street"),
     ] = None,
-    weights: Annotated[str, typer.Option(help="learned weights for their own presets; none: all untrained")] = "none",
+    weights: Annotated[
+        str, typer.Option(help="learned weights for their own presets; none: all untrained")
+    ] = "none",
     fidelity: Fidelity = "default",
-    offsets_px: Annotated[float, typer.Option(min=0, help="outward offset of deformable taps, pixels")] = 1.0,
+    offsets_px: Annotated[
+        float, typer.Option(min=0, help="outward offset of deformable taps, pixels")
+    ] = 1.0,
     height: Annotated[int, typer.Option(min=48, help="size of the image, pixels")] = 128,
     width: Annotated[int, typer.Option(min=48, help="size of the image, pixels")] = 416,
     device: Device = "auto",
@@ -352,12 +428,20 @@ def receptive_field(
     else:
         files = list_images(images)[:5] if images.is_dir() else []
         if len(files) < 5:
-            raise DataError(f"--images needs a folder of five consecutive images; {images} has {len(files)}")
+            raise DataError(
+                f"--images needs a folder of five consecutive images; {images} has {len(files)}"
+            )
         snippet = [resize_image(read_image(file), height, width) for file in files]
     torch.manual_seed(seed)
     learned = None if weights == "none" else (weights, load_model(weights))
-    every = [name for name, preset in PRESETS.items() if fidelity == "default" or preset.encoder == "paper"]
-    rows = measure_fields(network or every, fidelity, snippet, offsets_px, learned, choose_device(device))
+    every = [
+        name
+        for name, preset in PRESETS.items()
+        if fidelity == "default" or preset.encoder == "paper"
+    ]
+    rows = measure_fields(
+        network or every, fidelity, snippet, offsets_px, learned, choose_device(device)
+    )
     output.parent.mkdir(parents=True, exist_ok=True)
     draw_fields(rows, snippet[2], output)
     if as_json:
@@ -369,15 +453,21 @@ def receptive_field(
 
 @app.command()
 def convert(
-    files: Annotated[list[Path], typer.Argument(help="a depth checkpoint, a pose checkpoint, or both: .pth.tar")],
+    files: Annotated[
+        list[Path], typer.Argument(help="a depth checkpoint, a pose checkpoint, or both: .pth.tar")
+    ],
     output: Annotated[Path, typer.Option(help="receives the weights; a folder for --weights")],
     dilated: Annotated[
-        bool, typer.Option("--dilated", help="the pose network is the dilated one; not recorded in the file")
+        bool,
+        typer.Option(
+            "--dilated", help="the pose network is the dilated one; not recorded in the file"
+        ),
     ] = False,
     width: Annotated[int, typer.Option(min=32, help="size of the training images, pixels")] = 416,
     height: Annotated[int, typer.Option(min=32, help="size of the training images, pixels")] = 128,
     trained_on: Annotated[
-        list[str] | None, typer.Option(help="recording seen in training, e.g. kitti_odometry/00; repeat")
+        list[str] | None,
+        typer.Option(help="recording seen in training, e.g. kitti_odometry/00; repeat"),
     ] = None,
 ) -> None:
     """Convert weights of SfMLearner-PyTorch and ERF-SfMLearner; no code in the files is executed.
@@ -386,21 +476,27 @@ def convert(
     """
     from erfsfm.convert import convert as run_conversion
 
-    for old in run_conversion(files, output, dilated, (height, width), trained_on or (), _command()):
+    for old in run_conversion(
+        files, output, dilated, (height, width), trained_on or (), _command()
+    ):
         size = sum(value.numel() for value in old.tensors.values())
         typer.echo(f"{old.kind}: {old.preset}, {size:,} weights from {old.path}")
     if not trained_on:
-        typer.echo("training data unknown: leaks cannot be detected (--trained-on names it)", err=True)
+        typer.echo(
+            "training data unknown: leaks cannot be detected (--trained-on names it)", err=True
+        )
     typer.echo(f"weights in {output}: use them with --weights {output}")
 
 
 @app.command()
 def export(
     weights: Weights = "default",
-    output: Annotated[Path, typer.Option(help="depth network's file; the pose network goes beside it")] = Path(
-        "erfsfm.onnx"
-    ),
-    format_: Annotated[Literal["onnx"], typer.Option("--format", help="format of the files")] = "onnx",
+    output: Annotated[
+        Path, typer.Option(help="depth network's file; the pose network goes beside it")
+    ] = Path("erfsfm.onnx"),
+    format_: Annotated[
+        Literal["onnx"], typer.Option("--format", help="format of the files")
+    ] = "onnx",
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -413,10 +509,14 @@ def export(
 
     files = export_onnx(load_model(weights), output, seed)
     if as_json:
-        typer.echo(json.dumps([asdict(file) | {"path": str(file.path)} for file in files], indent=2))
+        typer.echo(
+            json.dumps([asdict(file) | {"path": str(file.path)} for file in files], indent=2)
+        )
         return
     for file in files:
-        typer.echo(f"{file.kind}: {file.preset} in {file.path}; differs from PyTorch by {file.difference:.1e}")
+        typer.echo(
+            f"{file.kind}: {file.preset} in {file.path}; differs from PyTorch by {file.difference:.1e}"
+        )
 
 
 def print_rows(rows: list[dict[str, Any]], as_json: bool) -> None:

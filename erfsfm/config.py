@@ -23,26 +23,42 @@ UNTRAINED = ("imagenet", "none")  # initial weights that no training of ours wro
 class NetworkConfig(Section):
     """Presets of the networks, their widths and their fidelity to the paper."""
 
-    depth: str = Field(default="depthnet", description="preset of the depth network, see erfsfm networks")
-    pose: str = Field(default="posenet", description="preset of the pose network, see erfsfm networks")
-    fidelity: Fidelity = Field(
-        default="default", description="paper: layers, intrinsics and photometric error of the reference code"
+    depth: str = Field(
+        default="depthnet", description="preset of the depth network, see erfsfm networks"
     )
-    depth_width: float = Field(default=1.0, gt=0, le=4, description="factor on the depth network's channels")
-    pose_width: float = Field(default=1.0, gt=0, le=4, description="factor on the pose network's channels")
+    pose: str = Field(
+        default="posenet", description="preset of the pose network, see erfsfm networks"
+    )
+    fidelity: Fidelity = Field(
+        default="default",
+        description="paper: layers, intrinsics and photometric error of the reference code",
+    )
+    depth_width: float = Field(
+        default=1.0, gt=0, le=4, description="factor on the depth network's channels"
+    )
+    pose_width: float = Field(
+        default=1.0, gt=0, le=4, description="factor on the pose network's channels"
+    )
     normalisation: Literal["none", "batch"] = Field(
         default="none", description="normalisation layer after each convolution"
     )
     activation: Literal["relu", "leaky"] = Field(
-        default="relu", description="leaky: leaky ReLU, for narrow decoders in which all ReLUs may die"
+        default="relu",
+        description="leaky: leaky ReLU, for narrow decoders in which all ReLUs may die",
     )
-    sources: Literal[2, 4] = Field(default=4, description="source frames of a snippet; with the target it has one more")
+    sources: Literal[2, 4] = Field(
+        default=4, description="source frames of a snippet; with the target it has one more"
+    )
     alignment: Literal["none", "images"] = Field(
         default="none",
         description="images: rotations and the direction of travel that the pose network guesses are measured in them",
     )
-    height: int = Field(default=128, ge=32, le=4096, description="height of the network input, pixels")
-    width: int = Field(default=416, ge=32, le=4096, description="width of the network input, pixels")
+    height: int = Field(
+        default=128, ge=32, le=4096, description="height of the network input, pixels"
+    )
+    width: int = Field(
+        default=416, ge=32, le=4096, description="width of the network input, pixels"
+    )
 
 
 class DataConfig(Section):
@@ -54,7 +70,12 @@ class DataConfig(Section):
         description="frames to train on by recording, e.g. {kitti_odometry/00: '0:250'}; empty: all",
     )
     exclude: list[str] = Field(
-        default_factory=lambda: ["kitti_odometry/03", "kitti_odometry/09", "kitti_odometry/10", EIGEN],
+        default_factory=lambda: [
+            "kitti_odometry/03",
+            "kitti_odometry/09",
+            "kitti_odometry/10",
+            EIGEN,
+        ],
         description="recordings or frames never trained on, also where a KITTI raw drive holds the same frames; eigen: "
         "the 28 test scenes of Eigen et al. among KITTI raw drives",
     )
@@ -64,7 +85,10 @@ class DataConfig(Section):
         "among the data",
     )
     validation_share: float = Field(
-        default=0.0, ge=0, lt=1, description="last part of each recording that is used for validation alone"
+        default=0.0,
+        ge=0,
+        lt=1,
+        description="last part of each recording that is used for validation alone",
     )
     split: str | None = Field(
         default=None,
@@ -76,15 +100,29 @@ class DataConfig(Section):
         "empty: by number of frames",
     )
     flip: float = Field(default=0.5, ge=0, le=1, description="probability of a horizontal flip")
-    zoom: float = Field(default=1.15, ge=1, le=2, description="largest factor of random scaling and cropping, per axis")
+    zoom: float = Field(
+        default=1.15,
+        ge=1,
+        le=2,
+        description="largest factor of random scaling and cropping, per axis",
+    )
     roll: float = Field(
-        default=0.0, ge=0, le=30, description="largest roll of the camera in labelled single images, degrees"
+        default=0.0,
+        ge=0,
+        le=30,
+        description="largest roll of the camera in labelled single images, degrees",
     )
     colour_jitter: float = Field(
-        default=0.0, ge=0, le=0.5, description="largest relative change of brightness, contrast, gamma"
+        default=0.0,
+        ge=0,
+        le=0.5,
+        description="largest relative change of brightness, contrast, gamma",
     )
     weather: float = Field(
-        default=0.0, ge=0, le=1, description="probability of simulated blur, rain and exposure changes in a snippet"
+        default=0.0,
+        ge=0,
+        le=1,
+        description="probability of simulated blur, rain and exposure changes in a snippet",
     )
     exact: float = Field(
         default=0.0,
@@ -93,14 +131,20 @@ class DataConfig(Section):
         description="share of each batch that is single images of simulated worlds with their true depth as the label "
         "(simulate --depth); such worlds are then used for nothing else",
     )
-    cache_mb: int = Field(default=4000, ge=0, description="memory for decoded images and labels, MB per process")
-    workers: int = Field(default=1, ge=0, le=128, description="data loader processes; 0: in the training process")
+    cache_mb: int = Field(
+        default=4000, ge=0, description="memory for decoded images and labels, MB per process"
+    )
+    workers: int = Field(
+        default=1, ge=0, le=128, description="data loader processes; 0: in the training process"
+    )
 
 
 class LossConfig(Section):
     """Terms of the objective and their weights; the defaults are the paper's."""
 
-    photometric_weight: float = Field(default=1.0, ge=0, description="weight of the photometric error; 0: not computed")
+    photometric_weight: float = Field(
+        default=1.0, ge=0, description="weight of the photometric error; 0: not computed"
+    )
     ssim_weight: float = Field(
         default=0.0, ge=0, le=1, description="weight of SSIM in the photometric error; 0: L1 alone"
     )
@@ -123,9 +167,12 @@ class TeacherConfig(Section):
         description="exact: true depth and poses of simulated worlds; many: poses by the SLAM system, learned depth "
         "refined by neighbours; network: the depth of the network of slam_weights, which is imitated",
     )
-    stride: int = Field(default=2, ge=1, description="every how many frames a label is measured under many views")
+    stride: int = Field(
+        default=2, ge=1, description="every how many frames a label is measured under many views"
+    )
     slam_weights: str = Field(
-        default="sim", description="weights of the SLAM system that gives the poses, or of the imitated network"
+        default="sim",
+        description="weights of the SLAM system that gives the poses, or of the imitated network",
     )
     rotation_weight: float = Field(default=0.0, ge=0, description="weight of the rotation error")
     translation_weight: float = Field(
@@ -133,7 +180,9 @@ class TeacherConfig(Section):
     )
     structure_weight: float = Field(default=0.0, ge=0, description="weight of the depth error")
     edge_weight: float = Field(
-        default=0.0, ge=0, description="weight of the error of the inverse depth's steps between pixels"
+        default=0.0,
+        ge=0,
+        description="weight of the error of the inverse depth's steps between pixels",
     )
     cache: Path | None = Field(
         default=None, description="folder that keeps what many views measured; else OUTPUT/teacher"
@@ -173,24 +222,36 @@ class TrainingConfig(Section):
     )
     batch: int = Field(default=4, ge=1, le=1024, description="snippets per step and device")
     devices: int = Field(
-        default=1, ge=1, description="GPUs, or processes on the CPU; batch normalisation is synchronised on GPUs alone"
+        default=1,
+        ge=1,
+        description="GPUs, or processes on the CPU; batch normalisation is synchronised on GPUs alone",
     )
     networks: TrainedNetworks = Field(
         default="both",
         description="trained networks; the other one keeps its initial weights, and is not written without any",
     )
     frozen_stages: int = Field(
-        default=0, ge=0, le=7, description="first stages of a lite0 encoder that keep their weights, the stem being one"
+        default=0,
+        ge=0,
+        le=7,
+        description="first stages of a lite0 encoder that keep their weights, the stem being one",
     )
     learning_rate: float = Field(default=2e-4, gt=0, description="of Adam")
     offset_rate: float = Field(
-        default=1.0, gt=0, le=1, description="factor on the learning rate of deformable offsets, which may diverge"
+        default=1.0,
+        gt=0,
+        le=1,
+        description="factor on the learning rate of deformable offsets, which may diverge",
     )
     encoder_rate: float = Field(
-        default=1.0, gt=0, le=1, description="factor on the learning rate of a lite0 encoder, which is pretrained"
+        default=1.0,
+        gt=0,
+        le=1,
+        description="factor on the learning rate of a lite0 encoder, which is pretrained",
     )
     schedule: Literal["constant", "cosine", "step"] = Field(
-        default="constant", description="of the learning rate; step: divided by ten in the last quarter"
+        default="constant",
+        description="of the learning rate; step: divided by ten in the last quarter",
     )
     average_decay: float = Field(
         default=0.0,
@@ -198,7 +259,9 @@ class TrainingConfig(Section):
         lt=1,
         description="of the moving average of the weights at every step, which is validated and written; 0: none",
     )
-    gradient_clip: float = Field(default=0.0, ge=0, description="largest gradient norm; 0: no clipping")
+    gradient_clip: float = Field(
+        default=0.0, ge=0, description="largest gradient norm; 0: no clipping"
+    )
     validate_every: int = Field(default=1000, ge=1, description="steps between validations")
     checkpoint_every: int = Field(default=500, ge=1, description="steps between checkpoints")
     precision: Precision = Field(
@@ -206,7 +269,9 @@ class TrainingConfig(Section):
         description="of the networks; a CPU uses bf16-mixed in place of 16-mixed, and 32-true if it has no bfloat16, "
         "with a warning",
     )
-    seed: int = Field(default=0, ge=0, le=2**31 - 1, description="of initial weights, snippets and augmentation")
+    seed: int = Field(
+        default=0, ge=0, le=2**31 - 1, description="of initial weights, snippets and augmentation"
+    )
 
     def of_batch(self, share: float) -> int:
         """Samples of a batch that a share comes to, rounded down."""
@@ -236,11 +301,17 @@ class ExperimentConfig(Section):
     def single_images(self) -> bool:
         """Whether labels of depth are all that is learned from, so that a sample needs no other view."""
         by_images = self.loss.photometric_weight + self.loss.smoothness_weight > 0
-        return self.training.networks == "depth" and self.teacher.structure_weight > 0 and not by_images
+        return (
+            self.training.networks == "depth"
+            and self.teacher.structure_weight > 0
+            and not by_images
+        )
 
     @model_validator(mode="after")
     def _parts_agree(self) -> Self:
-        if self.data.exact > 0 and (self.teacher.views == "exact" or self.teacher.structure_weight == 0):
+        if self.data.exact > 0 and (
+            self.teacher.views == "exact" or self.teacher.structure_weight == 0
+        ):
             raise ValueError(
                 "data.exact needs teacher.views: many or network, the labels of the rest of each batch, and a "
                 "teacher.structure_weight above 0"
@@ -262,7 +333,9 @@ class ExperimentConfig(Section):
                 "a teacher.rotation_weight or teacher.translation_weight above 0"
             )
         if self.training.minutes > 0 and self.training.devices > 1:
-            raise ValueError("training.minutes needs training.devices: 1: the clocks of several would differ")
+            raise ValueError(
+                "training.minutes needs training.devices: 1: the clocks of several would differ"
+            )
         return self
 
 
@@ -272,7 +345,9 @@ def config_folders() -> list[Path]:
     return [package / "_configs", package.parent / "configs" / "erfsfm"]
 
 
-def load_experiment(file_or_name: str | Path | None, overrides: Sequence[str] = ()) -> ExperimentConfig:
+def load_experiment(
+    file_or_name: str | Path | None, overrides: Sequence[str] = ()
+) -> ExperimentConfig:
     """Read an experiment and apply ``section.key=value`` overrides; None for the defaults.
 
     Raises:

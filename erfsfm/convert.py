@@ -31,7 +31,9 @@ _DEFORMABLE: dict[NetworkKind, dict[tuple[int, ...], str]] = {  # stages with of
 _FIRST_CHANNELS: dict[NetworkKind, int] = {"depth": 32, "pose": 16}  # of conv1 at full width
 _MARK: dict[NetworkKind, str] = {"depth": "predict_disp1.0.weight", "pose": "pose_pred.weight"}
 _ENCODER = re.compile(r"conv(?P<stage>[1-7])\.(?P<place>\d+)\.(?P<rest>.+)")
-_DECODER = re.compile(r"(?P<block>upconv|iconv|predict_disp|predict_mask)(?P<level>[1-7])\.(?P<rest>.+)")
+_DECODER = re.compile(
+    r"(?P<block>upconv|iconv|predict_disp|predict_mask)(?P<level>[1-7])\.(?P<rest>.+)"
+)
 
 
 @dataclass(frozen=True)
@@ -68,15 +70,21 @@ def convert(
         CheckpointError: unreadable, of another kind, or two of one kind; one line.
     """
     if (output / "model.yaml").exists():
-        raise CheckpointError(f"{output} holds weights already: name both checkpoints in one command")
+        raise CheckpointError(
+            f"{output} holds weights already: name both checkpoints in one command"
+        )
     networks: dict[NetworkKind, OldNetwork] = {}
     for file in files:
         network = read_old(file, dilated)
         if network.kind in networks:
-            raise CheckpointError(f"{networks[network.kind].path} and {file} both hold a {network.kind} network")
+            raise CheckpointError(
+                f"{networks[network.kind].path} and {file} both hold a {network.kind} network"
+            )
         networks[network.kind] = network
     if dilated and "pose" not in networks:
-        raise CheckpointError("dilated needs a pose network: the reference's dilated DispNetS cannot run")
+        raise CheckpointError(
+            "dilated needs a pose network: the reference's dilated DispNetS cannot run"
+        )
     settings: dict[str, Any] = {"fidelity": "paper", "height": size[0], "width": size[1]}
     for kind, network in networks.items():
         settings |= {kind: network.preset, f"{kind}_width": network.width}
@@ -85,7 +93,9 @@ def convert(
     try:
         config = NetworkConfig.model_validate(settings)
     except ValidationError as error:
-        raise CheckpointError(f"no network of ours has such layers: {first_problem(error)}") from error
+        raise CheckpointError(
+            f"no network of ours has such layers: {first_problem(error)}"
+        ) from error
     record = ModelRecord(
         network=config,
         networks="both" if len(networks) == 2 else next(iter(networks)),
@@ -113,18 +123,26 @@ def read_old(path: Path, dilated: bool = False) -> OldNetwork:
     kinds = [kind for kind, mark in _MARK.items() if mark in tensors]
     if not kinds or not any(name.startswith("conv1.0.") for name in tensors):
         some, marks = ", ".join(sorted(tensors)[:3]) or "nothing", " or ".join(_MARK.values())
-        raise CheckpointError(f"{path} holds neither DispNetS nor PoseExpNet: wanted conv1.0 and {marks}; found {some}")
+        raise CheckpointError(
+            f"{path} holds neither DispNetS nor PoseExpNet: wanted conv1.0 and {marks}; found {some}"
+        )
     kind = kinds[0]
     renamed, stages = _rename(path, kind, tensors)
     preset = _DEFORMABLE[kind].get(stages)
     if preset is None:
-        raise CheckpointError(f"{path} has deformable layers in conv {stages}; no network of the paper has these")
+        raise CheckpointError(
+            f"{path} has deformable layers in conv {stages}; no network of the paper has these"
+        )
     if dilated and kind == "pose":
         if stages:
             raise CheckpointError(f"{path} is deformable, not dilated: leave out --dilated")
         preset = "erf-posenet-dilated"
     kernels = (".0.0.weight", ".kernel.weight")
-    first = next(v for name, v in renamed.items() if name.startswith("encoder.stages.0.") and name.endswith(kernels))
+    first = next(
+        v
+        for name, v in renamed.items()
+        if name.startswith("encoder.stages.0.") and name.endswith(kernels)
+    )
     head = renamed.get("pose_head.weight")
     return OldNetwork(
         path=path,
@@ -138,26 +156,38 @@ def read_old(path: Path, dilated: bool = False) -> OldNetwork:
 
 def _tensors(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
-        raise CheckpointError(f"no file {path}: give a .pth.tar of SfMLearner-PyTorch or ERF-SfMLearner")
+        raise CheckpointError(
+            f"no file {path}: give a .pth.tar of SfMLearner-PyTorch or ERF-SfMLearner"
+        )
     wrong = "is damaged, no checkpoint, or would execute code: get it again"
     loaded = read_torch(path, CheckpointError, wrong)
     state = loaded.get("state_dict", loaded) if isinstance(loaded, Mapping) else None
-    if not isinstance(state, Mapping) or not all(isinstance(value, Tensor) for value in state.values()):
-        raise CheckpointError(f"{path} holds no state_dict of tensors: it is no SfMLearner checkpoint")
+    if not isinstance(state, Mapping) or not all(
+        isinstance(value, Tensor) for value in state.values()
+    ):
+        raise CheckpointError(
+            f"{path} holds no state_dict of tensors: it is no SfMLearner checkpoint"
+        )
     for name, value in state.items():
         if not torch.isfinite(value).all():
-            raise CheckpointError(f"{path}: '{name}' holds NaN or infinite values: use other weights")
+            raise CheckpointError(
+                f"{path}: '{name}' holds NaN or infinite values: use other weights"
+            )
     return {str(name).removeprefix("module."): value for name, value in state.items()}
 
 
-def _rename(path: Path, kind: NetworkKind, tensors: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], tuple[int, ...]]:
+def _rename(
+    path: Path, kind: NetworkKind, tensors: Mapping[str, Tensor]
+) -> tuple[dict[str, Tensor], tuple[int, ...]]:
     """Tensors under our names, and the encoder stages with deformable layers."""
     renamed: dict[str, Tensor] = {}
     layers: dict[tuple[int, int], dict[str, Tensor]] = {}
     for name, value in tensors.items():
         encoder, decoder = _ENCODER.fullmatch(name), _DECODER.fullmatch(name)
         if encoder:
-            layers.setdefault((int(encoder["stage"]), int(encoder["place"])), {})[encoder["rest"]] = value
+            layers.setdefault((int(encoder["stage"]), int(encoder["place"])), {})[
+                encoder["rest"]
+            ] = value
         elif decoder and kind == "pose":
             continue  # explainability masks: only training would need them
         elif decoder:
@@ -168,7 +198,9 @@ def _rename(path: Path, kind: NetworkKind, tensors: Mapping[str, Tensor]) -> tup
         elif name.startswith("pose_pred."):
             renamed[name.replace("pose_pred.", "pose_head.", 1)] = value
         else:
-            raise CheckpointError(f"{path} has a tensor '{name}', which DispNetS and PoseExpNet do not have")
+            raise CheckpointError(
+                f"{path} has a tensor '{name}', which DispNetS and PoseExpNet do not have"
+            )
     stages = set()
     for (stage, place), parts in layers.items():
         prefix = f"encoder.stages.{stage - 1}.{place // 2}.0"  # a ReLU stands between the convolutions of a stage
@@ -198,10 +230,14 @@ def _deformable(where: str, parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
         elif weight.shape[0] in (taps, 2 * taps):
             part = "modulator" if weight.shape[0] == taps else "offset"
         else:
-            raise CheckpointError(f"{where}.{name} fits no part of a modulated deformable layer: {tuple(weight.shape)}")
+            raise CheckpointError(
+                f"{where}.{name} fits no part of a modulated deformable layer: {tuple(weight.shape)}"
+            )
         found[f"{part}.weight"] = weight
         if bias is not None:
             found[f"{part}.bias"] = bias
     if len(found) != 5:
-        raise CheckpointError(f"{where} must hold offsets, modulator and kernel; found {', '.join(sorted(parts))}")
+        raise CheckpointError(
+            f"{where} must hold offsets, modulator and kernel; found {', '.join(sorted(parts))}"
+        )
     return found

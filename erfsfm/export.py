@@ -81,7 +81,11 @@ def export_onnx(model: Model, path: Path, seed: int = 0) -> list[Exported]:
     for kind, trained in model.networks.items():
         file, preset = paths[kind], getattr(config, kind)
         network = trained if kind == "depth" else PoseGraph(trained)
-        inputs, output = (["image"], "disparity") if kind == "depth" else (["target", "sources"], "T_source_target")
+        inputs, output = (
+            (["image"], "disparity")
+            if kind == "depth"
+            else (["target", "sources"], "T_source_target")
+        )
         given = [dict(zip(inputs, example)) for example in examples]
         graph = exported(network.eval(), [*given[0].values()], inputs, [output])
         described = onnx.load_model_from_string(graph)

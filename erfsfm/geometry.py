@@ -32,7 +32,9 @@ class Camera(Pinhole):
         """The camera of the resized image: ``c' = (c + 0.5) s - 0.5`` (the paper's code has ``c s``)."""
         if fidelity == "default":
             return super().resized(width, height)
-        return replace(self.multiplied(width / self.width, height / self.height), width=width, height=height)
+        return replace(
+            self.multiplied(width / self.width, height / self.height), width=width, height=height
+        )
 
     def multiplied(self, x: float, y: float) -> Self:
         """The rows of the camera matrix times factors, as the paper's code enlarges images; the size stays."""
@@ -48,7 +50,9 @@ class Camera(Pinhole):
         return replace(self, cx=mirror - self.cx)
 
 
-def scale_intrinsics(K: Tensor, size: tuple[int, int], full: tuple[int, int], fidelity: Fidelity) -> Tensor:
+def scale_intrinsics(
+    K: Tensor, size: tuple[int, int], full: tuple[int, int], fidelity: Fidelity
+) -> Tensor:
     """Camera matrices of an image pyramid level.
 
     Args:
@@ -164,11 +168,15 @@ def project_into_source(depth: Tensor, T_source_target: Tensor, K: Tensor) -> tu
         is in front of the source camera and inside its image, ``(B, 1, H, W)``.
     """
     batch, _, height, width = depth.shape
-    points_source = T_source_target[:, :3, :3] @ backproject(depth, K) + T_source_target[:, :3, 3:]  # (B, 3, H*W)
+    points_source = (
+        T_source_target[:, :3, :3] @ backproject(depth, K) + T_source_target[:, :3, 3:]
+    )  # (B, 3, H*W)
     z = points_source[:, 2:]
     pixels = (K @ points_source)[:, :2] / z.clamp(min=MINIMUM_Z)  # (B, 2, H*W)
     extents = max(width - 1, 1), max(height - 1, 1)
-    axes = [2 * pixels[:, k : k + 1] / extent - 1 for k, extent in enumerate(extents)]  # (B, 1, H*W) each
+    axes = [
+        2 * pixels[:, k : k + 1] / extent - 1 for k, extent in enumerate(extents)
+    ]  # (B, 1, H*W) each
     inside = z > MINIMUM_Z
     for axis, extent in zip(axes, extents):
         # half a thousandth of a pixel of slack: round-off must not cut the border off an identity warp

@@ -30,7 +30,9 @@ from erfsfm.model_record import record_of_whole_weights as record_of_whole_weigh
 from erfsfm.networks.onnx_graph import OnnxGraph
 from erfsfm.snippet_motion import LIKE_KITTI, Followed, followed, measured
 
-if TYPE_CHECKING:  # PyTorch takes seconds to import, and is needed only where no graph of the networks is kept
+if (
+    TYPE_CHECKING
+):  # PyTorch takes seconds to import, and is needed only where no graph of the networks is kept
     from torch import nn
 
     from erfsfm.checkpoint import Model
@@ -72,7 +74,9 @@ def choose_device(choice: str) -> Device:
 
         available = torch.cuda.is_available()
     if choice == "cuda" and not available:
-        raise ConfigError("device cuda is not available on this machine or in this build of torch; use cpu")
+        raise ConfigError(
+            "device cuda is not available on this machine or in this build of torch; use cpu"
+        )
     return "cuda" if available else "cpu"
 
 
@@ -98,7 +102,8 @@ def _graphs(folder: Path, sha256: str) -> dict[NetworkKind, OnnxGraph]:
         return model().networks[kind]
 
     graphs = {
-        kind: OnnxGraph(partial(network, kind), NETWORK_THREADS, f"{kind} {sha256} {config!r}") for kind in record.kinds
+        kind: OnnxGraph(partial(network, kind), NETWORK_THREADS, f"{kind} {sha256} {config!r}")
+        for kind in record.kinds
     }
     if "depth" not in graphs or not graphs["depth"].is_kept((1, 3, config.height, config.width)):
         model()  # damaged weights are found before the first image
@@ -111,7 +116,11 @@ class DepthPosePredictor:
     origin: str = "these weights"
 
     def __init__(
-        self, record: ModelRecord, networks: Mapping[NetworkKind, Network], device: Device, sha256: str = ""
+        self,
+        record: ModelRecord,
+        networks: Mapping[NetworkKind, Network],
+        device: Device,
+        sha256: str = "",
     ) -> None:
         self.device = device
         self.record = record
@@ -152,7 +161,9 @@ class DepthPosePredictor:
         folder, chosen = find_weights(name_or_dir), choose_device(device)
         sha256 = weights_sha256(folder)
         if runtime == "onnx" and chosen == "cpu":
-            predictor = cls(read_record(folder / "model.yaml"), _graphs(folder, sha256), chosen, sha256)
+            predictor = cls(
+                read_record(folder / "model.yaml"), _graphs(folder, sha256), chosen, sha256
+            )
         else:
             from erfsfm.checkpoint import load_model
 
@@ -179,7 +190,9 @@ class DepthPosePredictor:
         if size is None:
             return depth_at(self.disparity(image), height, width)
         return depth_at(
-            self.disparity(_input(image, size.height, size.width)) * np.float32(size.disparity), height, width
+            self.disparity(_input(image, size.height, size.width)) * np.float32(size.disparity),
+            height,
+            width,
         )
 
     def prepare(self, image: NDArray[np.uint8] | Array) -> Array:
@@ -204,7 +217,9 @@ class DepthPosePredictor:
         """
         return np.asarray(self._output("depth", self.prepare(image))[0])
 
-    def poses(self, images: Sequence[NDArray[np.uint8] | Array], camera: Pinhole | None = None) -> NDArray[np.float64]:
+    def poses(
+        self, images: Sequence[NDArray[np.uint8] | Array], camera: Pinhole | None = None
+    ) -> NDArray[np.float64]:
         """Poses of a snippet's sources.
 
         Args:
@@ -229,7 +244,10 @@ class DepthPosePredictor:
         return self.record.network.alignment == "images"
 
     def measured_poses(
-        self, guess: NDArray[np.float64], images: Sequence[NDArray[np.uint8] | Array], camera: Pinhole | None
+        self,
+        guess: NDArray[np.float64],
+        images: Sequence[NDArray[np.uint8] | Array],
+        camera: Pinhole | None,
     ) -> NDArray[np.float64]:
         """As `poses`, from their `guessed_poses`, which stay where nothing is measured."""
         if not self.measures:
@@ -261,17 +279,23 @@ class DepthPosePredictor:
         for first, second, step in self._steps:
             if first is image and second is after:
                 return step
-        step = followed(*(np.round((each[0, 1] + 1) * 127.5).astype(np.uint8) for each in (image, after)))  # of green
+        step = followed(
+            *(np.round((each[0, 1] + 1) * 127.5).astype(np.uint8) for each in (image, after))
+        )  # of green
         self._steps.append((image, after, step))
         return step
 
     def _output(self, kind: NetworkKind, *inputs: Array | list[Array]) -> Array:
         """Of a network for one input, refused where it is not finite: float16 weights may overflow in the pass."""
         if kind not in self._networks:
-            raise CheckpointError(f"{self.origin} holds no {kind} network: use weights that have both")
+            raise CheckpointError(
+                f"{self.origin} holds no {kind} network: use weights that have both"
+            )
         output: Array = self._networks[kind](*inputs)[0]
         if not np.isfinite(output).all():
-            raise CheckpointError(f"the {kind} network of {self.origin} gives NaN or infinity: use other weights")
+            raise CheckpointError(
+                f"the {kind} network of {self.origin} gives NaN or infinity: use other weights"
+            )
         return output
 
 
@@ -280,7 +304,9 @@ def refuse_leak(networks: DepthPosePredictor, names: Sequence[str], allow_leak: 
     leaked = networks.leaks(names)
     if leaked and not allow_leak:
         some = ", ".join(leaked[:5]) + (f" and {len(leaked) - 5} more" if len(leaked) > 5 else "")
-        raise DataError(f"leak: these weights were trained on {some}; choose other weights or data, or --allow-leak")
+        raise DataError(
+            f"leak: these weights were trained on {some}; choose other weights or data, or --allow-leak"
+        )
     return bool(leaked)
 
 
@@ -289,7 +315,9 @@ def learned_inverse_depth(weights: str, image: NDArray[np.uint8]) -> NDArray[np.
     return np.reciprocal(_predictor(weights).depth(image))
 
 
-_predictor = lru_cache(maxsize=1)(partial(DepthPosePredictor.from_weights, device="cpu", runtime="onnx"))
+_predictor = lru_cache(maxsize=1)(
+    partial(DepthPosePredictor.from_weights, device="cpu", runtime="onnx")
+)
 
 
 def _input(image: NDArray[np.uint8] | Array, height: int, width: int) -> Array:
@@ -322,7 +350,9 @@ def require_image(image: object) -> None:
 def depth_at(disparity: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
     """Depth ``(height, width)`` from disparity ``(h, w)`` at the networks' size, both unscaled."""
     if disparity.shape != (height, width):
-        disparity = np.asarray(cv2.resize(disparity, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+        disparity = np.asarray(
+            cv2.resize(disparity, (width, height), interpolation=cv2.INTER_LINEAR), np.float32
+        )
     return np.asarray(1 / disparity, dtype=np.float32)
 
 

@@ -30,7 +30,10 @@ SKY_INVERSE_DEPTH = 1 / 60  # of a camera height: the sky is farther than 100 m
 
 
 def label(
-    target: Grey, neighbours: Sequence[Grey], K: NDArray[np.floating], T_neighbour_target: NDArray[np.float64]
+    target: Grey,
+    neighbours: Sequence[Grey],
+    K: NDArray[np.floating],
+    T_neighbour_target: NDArray[np.float64],
 ) -> tuple[Array, Array]:
     """Least and most inverse depth of each pixel ``(H, W)``, in one over camera heights; 0 and infinite if unknown.
 
@@ -80,7 +83,10 @@ def sky_mask(grey: Grey, horizon: tuple[float, float]) -> NDArray[np.bool_]:
     """
     height, width = grey.shape
     smooth = cv2.GaussianBlur(grey, (5, 5), 0).astype(np.float32)
-    slope = cv2.blur(np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)) / 8, (3, 3))
+    slope = cv2.blur(
+        np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)) / 8,
+        (3, 3),
+    )
     bright = SKY_BRIGHTNESS * np.percentile(smooth[: height // 2], 98)
     plain = (smooth > bright) & (slope < SKY_GRADIENT)
     _, component = cv2.connectedComponents(plain.astype(np.uint8), connectivity=4)
@@ -133,7 +139,9 @@ def shrunk(least: Array, most: Array, factor: int) -> tuple[Array, Array]:
         return least, most
     height, width = (length // factor for length in least.shape)
     both = (least > 0) & np.isfinite(most)
-    with np.errstate(divide="ignore", invalid="ignore"):  # a bound that is not known is 0 or infinite
+    with np.errstate(
+        divide="ignore", invalid="ignore"
+    ):  # a bound that is not known is 0 or infinite
         low, high, middle = (
             values.reshape(height, factor, width, factor).swapaxes(1, 2).reshape(height, width, -1)
             for values in (np.log(least), np.log(most), np.where(both, np.log(least * most) / 2, 0))
@@ -202,12 +210,17 @@ def road_plane(
     across = np.cross([0.0, 1.0, 0.0], forward)
     across /= np.linalg.norm(across)
     down = np.cross(forward, across)
-    flat = (points @ np.stack([across, down], axis=1)).astype(np.float64)  # (n, 2): along forward a plane is constant
+    flat = (points @ np.stack([across, down], axis=1)).astype(
+        np.float64
+    )  # (n, 2): along forward a plane is constant
     rng = np.random.default_rng(0)
     first, second = flat[rng.integers(len(flat), size=(2, TRIALS))]
     determinant = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
     good = np.abs(determinant) > 1e-9
-    lines = np.stack([second[:, 1] - first[:, 1], first[:, 0] - second[:, 0]], axis=1)[good] / determinant[good, None]
+    lines = (
+        np.stack([second[:, 1] - first[:, 1], first[:, 0] - second[:, 0]], axis=1)[good]
+        / determinant[good, None]
+    )
     lines = lines[lines[:, 1] > LEAST_UPRIGHT * np.linalg.norm(lines, axis=1)]
     if not len(lines):
         return None
@@ -226,7 +239,10 @@ def on_road(inverse_depth: Array, known: NDArray[np.bool_], road: Array) -> NDAr
     height, width = inverse_depth.shape
     window = (2 * int(AROUND[1] * width / 2) + 1, 2 * int(AROUND[0] * height / 2) + 1)
     agreeing = known & (np.abs(inverse_depth - road) < NEAR * road)
-    ratio = [cv2.blur(mask.astype(np.float32), window, borderType=cv2.BORDER_CONSTANT) for mask in (known, agreeing)]
+    ratio = [
+        cv2.blur(mask.astype(np.float32), window, borderType=cv2.BORDER_CONSTANT)
+        for mask in (known, agreeing)
+    ]
     level = (road > 0) & (ratio[0] > LEAST_AROUND) & (ratio[1] > LEAST_AGREEING * ratio[0])
     return np.asarray(level & ~(known & (np.abs(inverse_depth - road) > NEAR * road)))
 
@@ -241,7 +257,9 @@ def under_road(inverse_depth: Array, sigma: Array, road: Array) -> NDArray[np.bo
     return np.asarray((cv2.dilate(under.astype(np.uint8), rim) > 0) & (road > 0))
 
 
-def impose_road(inverse_depth: Array, sigma: Array, reliable: NDArray[np.bool_], road: Array) -> Array:
+def impose_road(
+    inverse_depth: Array, sigma: Array, reliable: NDArray[np.bool_], road: Array
+) -> Array:
     """Forget what lies under the road and put the road's own depth where an unknown pixel lies on it, both in place.
 
     Args:
@@ -318,7 +336,9 @@ def combine(values: Array, sigmas: Array) -> tuple[Array, Array]:
 def rays(height: int, width: int, K: NDArray[np.floating]) -> Array:
     """``K^-1 (u, v, 1)`` of every pixel, ``(H, W, 3)``."""
     v, u = np.mgrid[:height, :width].astype(np.float32)
-    return np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1).astype(np.float32)
+    return np.stack(
+        [(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1
+    ).astype(np.float32)
 
 
 def optical_flow(first: Grey, second: Grey, fine: bool) -> tuple[Array, NDArray[np.bool_]]:
@@ -331,7 +351,12 @@ def optical_flow(first: Grey, second: Grey, fine: bool) -> tuple[Array, NDArray[
     back = search.calc(second, first, None)
     v, u = np.mgrid[: first.shape[0], : first.shape[1]].astype(np.float32)
     back_there = cv2.remap(
-        back, u + there[..., 0], v + there[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1e3
+        back,
+        u + there[..., 0],
+        v + there[..., 1],
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=1e3,
     )
     return there, np.linalg.norm(there + back_there, axis=-1) < ROUND_TRIP_PX
 

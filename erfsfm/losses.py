@@ -37,7 +37,9 @@ def _box(x: Tensor) -> Tensor:
     return box.mul_(1 / 9)
 
 
-box_mean: Callable[[Tensor], Tensor] = BoxMean.apply  # over each 3 x 3 window of ``(..., H, W)``, without padding
+box_mean: Callable[[Tensor], Tensor] = (
+    BoxMean.apply
+)  # over each 3 x 3 window of ``(..., H, W)``, without padding
 
 
 def dissimilarity(first: Tensor, second: Tensor) -> Tensor:
@@ -185,7 +187,8 @@ def step_disagreement(disparity: Tensor, bounds: Bounds) -> Tensor:
             length = max(error.shape[axis] - apart, 0)
             first, second = (values.narrow(axis, 0, length) for values in (error, narrow))
             first_on, second_on = (
-                values.narrow(axis, error.shape[axis] - length, length) for values in (error, narrow)
+                values.narrow(axis, error.shape[axis] - length, length)
+                for values in (error, narrow)
             )
             both = second & second_on
             total = total + ((first_on - first).abs() * both).sum() / both.sum().clamp(min=1)

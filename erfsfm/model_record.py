@@ -28,7 +28,9 @@ class DepthInput(Section):
 
     height: int = Field(ge=1, le=4096, description="of the network's input, pixels")
     width: int = Field(ge=1, le=4096, description="of the network's input, pixels")
-    disparity: float = Field(default=1.0, gt=0, description="factor on its output that keeps the unit of the training")
+    disparity: float = Field(
+        default=1.0, gt=0, description="factor on its output that keeps the unit of the training"
+    )
 
 
 class ModelRecord(Section):
@@ -38,10 +40,16 @@ class ModelRecord(Section):
 
     format: Literal[1] = FORMAT
     network: NetworkConfig
-    networks: Literal["both", "depth", "pose"] = Field(default="both", description="which of the two are there")
-    trained_on: list[str] = Field(description="recordings and frame ranges seen in training: the leak record")
+    networks: Literal["both", "depth", "pose"] = Field(
+        default="both", description="which of the two are there"
+    )
+    trained_on: list[str] = Field(
+        description="recordings and frame ranges seen in training: the leak record"
+    )
     licence: str = Field("unknown: depends on the training data", description="of the weights")
-    depth_input: DepthInput | None = Field(default=None, description="of single images, if not as in the training")
+    depth_input: DepthInput | None = Field(
+        default=None, description="of single images, if not as in the training"
+    )
     step: int = 0
     metrics: dict[str, float] = Field(default_factory=dict, description="of the last validation")
     version: str = ""
@@ -68,7 +76,9 @@ def read_record(path: Path) -> ModelRecord:
     Raises:
         CheckpointError: damaged, or of another format.
     """
-    return read_model(ModelRecord, path, CheckpointError, f"is not a model record of format {FORMAT}")
+    return read_model(
+        ModelRecord, path, CheckpointError, f"is not a model record of format {FORMAT}"
+    )
 
 
 def find_weights(name_or_folder: str | Path) -> Path:
@@ -85,7 +95,9 @@ def find_weights(name_or_folder: str | Path) -> Path:
         return SHIPPED / str(name_or_folder)
     if folder.is_dir():
         raise CheckpointError(f"{folder} holds no model.yaml: it is no output folder of a training")
-    raise CheckpointError(f"no weights '{name_or_folder}': neither a folder nor one of {', '.join(shipped) or 'none'}")
+    raise CheckpointError(
+        f"no weights '{name_or_folder}': neither a folder nor one of {', '.join(shipped) or 'none'}"
+    )
 
 
 def tensors_file(folder: Path, kind: NetworkKind) -> Path:
@@ -116,10 +128,14 @@ def read_tensors(folder: Path, kind: NetworkKind) -> dict[str, NDArray[Any]]:
     try:
         tensors: dict[str, NDArray[Any]] = load_file(path)
     except (OSError, SafetensorError) as error:
-        raise CheckpointError(f"{path} is damaged or missing ({error}); copy the whole weights folder") from error
+        raise CheckpointError(
+            f"{path} is damaged or missing ({error}); copy the whole weights folder"
+        ) from error
     for key, value in tensors.items():
         if not np.isfinite(value).all():
-            raise CheckpointError(f"{path}: '{key}' holds NaN or infinite values: use other weights")
+            raise CheckpointError(
+                f"{path}: '{key}' holds NaN or infinite values: use other weights"
+            )
     return tensors
 
 

@@ -44,7 +44,10 @@ _TITLE = (
     "Receptive field of the middle output of the last encoder layer\nleft: bright pixels can reach it; blue: their "
     f"bounding box; dashed: theoretical box.  right: gradient magnitude, {HELD:.0%} of which is in the stated share"
 )
-_HEIGHT_M, _HALF_WIDTH_M = 1.65, 7.0  # of the synthetic street: camera over the road, and walls beside it
+_HEIGHT_M, _HALF_WIDTH_M = (
+    1.65,
+    7.0,
+)  # of the synthetic street: camera over the road, and walls beside it
 _FOCAL_SHARE = 0.58  # focal length over image width, as KITTI's
 
 
@@ -89,7 +92,9 @@ def measure_fields(
         ConfigError: an unknown name, or a snippet that is not five images.
     """
     if len(snippet) != 5:
-        raise ConfigError(f"receptive fields are measured on 5 consecutive images; got {len(snippet)}")
+        raise ConfigError(
+            f"receptive fields are measured on 5 consecutive images; got {len(snippet)}"
+        )
     wanted: list[tuple[str, Fidelity]] = []
     for name in names:
         wanted.append((name, fidelity))
@@ -134,11 +139,24 @@ def draw_fields(rows: Sequence[FieldRow], image: NDArray[np.uint8], path: Path) 
 def _draw_seen(axis: Axes, row: FieldRow, image: NDArray[np.uint8]) -> None:
     field, side, offsets_px = row.seen, row.summary["theoretical_px"], row.summary["offsets_px"]
     read = field.gradient.cpu().numpy() > 0
-    axis.imshow(np.where(read[..., None], image, (image * _DIM).astype(np.uint8)), interpolation="nearest")
+    axis.imshow(
+        np.where(read[..., None], image, (image * _DIM).astype(np.uint8)), interpolation="nearest"
+    )
     boxes = [(*row.corner, side, side, _BOX, "--")]
-    boxes += [(field.top, field.left, field.rows, field.columns, _MEASURED, "-")] if field.rows else []
+    boxes += (
+        [(field.top, field.left, field.rows, field.columns, _MEASURED, "-")] if field.rows else []
+    )
     for top, left, rows, columns, colour, style in boxes:
-        axis.add_patch(Rectangle((left - 0.5, top - 0.5), columns, rows, fill=False, edgecolor=colour, linestyle=style))
+        axis.add_patch(
+            Rectangle(
+                (left - 0.5, top - 0.5),
+                columns,
+                rows,
+                fill=False,
+                edgecolor=colour,
+                linestyle=style,
+            )
+        )
     taps = f", taps pushed {offsets_px:g} px" if offsets_px else ""
     said = f"{row.title}{taps}: {side} px in theory, box {field.columns} x {field.rows}"
     axis.set_title(f"{said}, {field.coverage:.1%} of the image", fontsize=7.5, loc="left", pad=3)
@@ -150,7 +168,11 @@ def _draw_weighed(axis: Axes, row: FieldRow, image: NDArray[np.uint8]) -> None:
     strength = np.sqrt(weight / max(weight.max(), 1e-30))
     axis.imshow(strength, cmap=_HEAT, alpha=np.clip(1.6 * strength, 0, 0.95), vmin=0, vmax=1)
     ratio = row.summary["effective_share_95"]
-    extent = f"{HELD:.0%} in {ratio:.1%} of the image" if ratio else "nothing: no pixel influences the output"
+    extent = (
+        f"{HELD:.0%} in {ratio:.1%} of the image"
+        if ratio
+        else "nothing: no pixel influences the output"
+    )
     axis.set_title(f"weights: {row.summary['weights']}; {extent}", fontsize=7.5, loc="left", pad=3)
 
 
@@ -172,12 +194,20 @@ def _row(
         title, model = learned
         config, kind = model.record.network, PRESETS[name].kind
         trained = model.networks.get(kind)
-        if (getattr(config, kind), config.fidelity) == (name, fidelity) and isinstance(trained, Network):
+        if (getattr(config, kind), config.fidelity) == (name, fidelity) and isinstance(
+            trained, Network
+        ):
             network, weights = trained, title
     # the middle image ``(1, C, H, W)`` in [-1, 1], for a pose network with its sources behind it
     sources, middle = network.input_channels // 3 - 1, len(snippet) // 2
-    around = [i for i in range(middle - sources // 2, middle + (sources + 1) // 2 + 1) if i != middle]
-    images = np.stack([snippet[i] for i in (middle, *around)]).transpose(0, 3, 1, 2).reshape(1, -1, *size)
+    around = [
+        i for i in range(middle - sources // 2, middle + (sources + 1) // 2 + 1) if i != middle
+    ]
+    images = (
+        np.stack([snippet[i] for i in (middle, *around)])
+        .transpose(0, 3, 1, 2)
+        .reshape(1, -1, *size)
+    )
     shown = torch.from_numpy(images).float() / 127.5 - 1
     weighed = field_of(network.encoder.eval().to(device), shown.to(device))
     summary = {
@@ -210,8 +240,13 @@ def street_snippet(frames: int, height: int, width: int) -> list[NDArray[np.uint
     for z in (z_m + depth for z_m in range(frames)):
         lane = (np.abs(np.abs(x) - 2) < 0.12) & (np.mod(z, 6) < 3)
         window = (np.mod(z, 3) < 1.2) & (np.mod(y, 2.5) < 1.3)
-        grain = np.mean([np.sin(a * across + b * z + a * b) for a, b in ((2.1, 1.3), (5.3, -3.1), (-9.7, 7.9))], axis=0)
+        grain = np.mean(
+            [np.sin(a * across + b * z + a * b) for a, b in ((2.1, 1.3), (5.3, -3.1), (-9.7, 7.9))],
+            axis=0,
+        )
         shade = np.where(wall, 0.62 - 0.3 * window, 0.33 + 0.5 * lane) + 0.1 * grain
         shade = np.where(wall & (y < -6), 0.92, shade / (1 + depth / 300))  # sky above the walls
-        views.append(np.repeat(np.rint(255 * np.clip(shade, 0, 1)).astype(np.uint8)[..., None], 3, axis=2))
+        views.append(
+            np.repeat(np.rint(255 * np.clip(shade, 0, 1)).astype(np.uint8)[..., None], 3, axis=2)
+        )
     return views

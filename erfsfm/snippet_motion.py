@@ -24,14 +24,25 @@ Array = NDArray[np.float64]
 _CELL = 16  # pixels a side; of each cell the best corner is followed
 _WINDOW = 11  # pixels
 _HALVINGS = 3
-_SEARCH = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03  # iterations, and pixels of the last one
+_SEARCH = (
+    cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS,
+    10,
+    0.03,
+)  # iterations, and pixels of the last one
 _LEAST_TEXTURE = 1e-4  # smaller eigenvalue of the structure tensor, by OpenCV's measure
 _SAME = 0.5  # pixels from a corner to where it is followed back to
 _PIXEL_SIGMA = 0.25
 _GUESS_SIGMA = np.radians(0.6)  # of the guessed direction of travel
 _LARGEST_TURN = np.radians(3.0)  # sigma of a rotation in one step of the least squares
-_OUTLIERS = (8.0, 3.0, 1.0, 1.0)  # sigmas at which a corner counts half, for each step (Cauchy's weights)
-LIKE_KITTI = Pinhole(1, 1, 0.58, 1.92, 0.495 - 0.5, 0.48 - 0.5)  # of images whose camera nobody tells, once resized
+_OUTLIERS = (
+    8.0,
+    3.0,
+    1.0,
+    1.0,
+)  # sigmas at which a corner counts half, for each step (Cauchy's weights)
+LIKE_KITTI = Pinhole(
+    1, 1, 0.58, 1.92, 0.495 - 0.5, 0.48 - 0.5
+)  # of images whose camera nobody tells, once resized
 
 
 class Followed(NamedTuple):
@@ -49,14 +60,29 @@ def followed(image: NDArray[np.uint8], after: NDArray[np.uint8]) -> Followed:
     cells = strength.reshape(rows, _CELL, columns, _CELL).swapaxes(1, 2).reshape(rows * columns, -1)
     best = cells.argmax(axis=1)
     row, column = np.divmod(np.arange(rows * columns), columns)
-    corners = np.stack([column * _CELL + best % _CELL, row * _CELL + best // _CELL], axis=1).astype(np.float32)
+    corners = np.stack([column * _CELL + best % _CELL, row * _CELL + best // _CELL], axis=1).astype(
+        np.float32
+    )
     search: dict[str, Any] = {"winSize": (_WINDOW, _WINDOW), "criteria": _SEARCH}
-    found, there, _ = cv2.calcOpticalFlowPyrLK(image, after, corners[:, None], None, maxLevel=_HALVINGS, **search)  # type: ignore[call-overload]
-    search |= {"maxLevel": 0, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}  # back from where it was takes no pyramid
-    returned, back, _ = cv2.calcOpticalFlowPyrLK(after, image, found, corners[:, None].copy(), **search)
-    known = (there[:, 0] > 0) & (back[:, 0] > 0) & (np.abs(returned[:, 0] - corners).max(axis=1) < _SAME)
+    found, there, _ = cv2.calcOpticalFlowPyrLK(
+        image, after, corners[:, None], None, maxLevel=_HALVINGS, **search
+    )  # type: ignore[call-overload]
+    search |= {
+        "maxLevel": 0,
+        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+    }  # back from where it was takes no pyramid
+    returned, back, _ = cv2.calcOpticalFlowPyrLK(
+        after, image, found, corners[:, None].copy(), **search
+    )
+    known = (
+        (there[:, 0] > 0)
+        & (back[:, 0] > 0)
+        & (np.abs(returned[:, 0] - corners).max(axis=1) < _SAME)
+    )
     known &= cells.max(axis=1) > _LEAST_TEXTURE
-    return Followed(corners.astype(float), np.where(known[:, None], found[:, 0], corners).astype(float), known)
+    return Followed(
+        corners.astype(float), np.where(known[:, None], found[:, 0], corners).astype(float), known
+    )
 
 
 def measured(T_source_target: Array, steps: Sequence[Followed], camera: Pinhole) -> Array:
@@ -76,7 +102,9 @@ def measured(T_source_target: Array, steps: Sequence[Followed], camera: Pinhole)
     R, t = T_next_image[:, :3, :3], T_next_image[:, :3, 3]
     travel = np.linalg.solve(_halfway(R), t[..., None])[..., 0].mean(axis=0)
     length = np.linalg.norm(travel)
-    R, direction = _fitted(steps, camera, R, travel / length if length > 0 else np.array([0.0, 0.0, -1.0]))
+    R, direction = _fitted(
+        steps, camera, R, travel / length if length > 0 else np.array([0.0, 0.0, -1.0])
+    )
     T_next_image = np.tile(np.eye(4), (count, 1, 1))
     T_next_image[:, :3, :3], T_next_image[:, :3, 3] = R, length * _halfway(R) @ direction
     T = [np.eye(4)]
@@ -88,7 +116,9 @@ def measured(T_source_target: Array, steps: Sequence[Followed], camera: Pinhole)
     return np.stack(T)
 
 
-def _fitted(steps: Sequence[Followed], camera: Pinhole, R: Array, guess: Array) -> tuple[Array, Array]:
+def _fitted(
+    steps: Sequence[Followed], camera: Pinhole, R: Array, guess: Array
+) -> tuple[Array, Array]:
     """Rotations ``(N, 3, 3)`` from each image to the next, and the direction of travel ``(3,)``, by Gauss and Newton.
 
     The residual of a corner is its distance in pixels from the epipolar line ``t x R x`` of its ray ``x``, in the next
@@ -96,7 +126,9 @@ def _fitted(steps: Sequence[Followed], camera: Pinhole, R: Array, guess: Array) 
     """
     f, c = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     rays, seen = (
-        np.pad((np.stack(pixels) - c) / f, ((0, 0), (0, 0), (0, 1)), constant_values=1.0).swapaxes(1, 2).copy()
+        np.pad((np.stack(pixels) - c) / f, ((0, 0), (0, 0), (0, 1)), constant_values=1.0)
+        .swapaxes(1, 2)
+        .copy()
         for pixels in ([step.before for step in steps], [step.after for step in steps])
     )
     information = np.stack([step.known for step in steps])[:, None] / _PIXEL_SIGMA**2
@@ -105,20 +137,30 @@ def _fitted(steps: Sequence[Followed], camera: Pinhole, R: Array, guess: Array) 
     for outlier in _OUTLIERS:
         M = _halfway(R)
         t, turned = (M @ direction)[..., None], R @ rays
-        slope = t[:, [1, 2]] * turned[:, [2, 0]] - t[:, [2, 0]] * turned[:, [1, 2]]  # of the epipolar line
+        slope = (
+            t[:, [1, 2]] * turned[:, [2, 0]] - t[:, [2, 0]] * turned[:, [1, 2]]
+        )  # of the epipolar line
         width = np.maximum(np.sqrt(((slope / f[:, None]) ** 2).sum(axis=1, keepdims=True)), 1e-12)
-        normal = turned[:, [1, 2, 0]] * seen[:, [2, 0, 1]] - turned[:, [2, 0, 1]] * seen[:, [1, 2, 0]]
-        by_turn = seen * (turned * t).sum(axis=1, keepdims=True) - t * (turned * seen).sum(axis=1, keepdims=True)
+        normal = (
+            turned[:, [1, 2, 0]] * seen[:, [2, 0, 1]] - turned[:, [2, 0, 1]] * seen[:, [1, 2, 0]]
+        )
+        by_turn = seen * (turned * t).sum(axis=1, keepdims=True) - t * (turned * seen).sum(
+            axis=1, keepdims=True
+        )
         J = np.concatenate([by_turn, normal], axis=1) / width  # (N, 6, P)
         error = (J[:, 3:] * t).sum(axis=1, keepdims=True)
         weighted = J * (information / (1 + information * (error / outlier) ** 2))
         A, b = weighted @ J.swapaxes(1, 2), -(weighted * error).sum(axis=2)
         A[:, :3, :3] += np.eye(3) / _LARGEST_TURN**2
-        of_travel, turn = np.split(np.linalg.solve(A[:, :3, :3], np.dstack([A[:, :3, 3:], b[:, :3]])), [3], axis=-1)
+        of_travel, turn = np.split(
+            np.linalg.solve(A[:, :3, :3], np.dstack([A[:, :3, 3:], b[:, :3]])), [3], axis=-1
+        )
         left = A[:, 3:, 3:] - A[:, 3:, :3] @ of_travel
         right = b[:, 3:] - (A[:, 3:, :3] @ turn)[..., 0]
         system = (M.swapaxes(1, 2) @ left @ M).sum(axis=0) + prior
-        shift = np.linalg.solve(system, _turned(M.swapaxes(1, 2), right).sum(axis=0) + prior @ (guess - direction))
+        shift = np.linalg.solve(
+            system, _turned(M.swapaxes(1, 2), right).sum(axis=0) + prior @ (guess - direction)
+        )
         R = Rotation.from_rotvec(turn[..., 0] - _turned(of_travel, M @ shift)).as_matrix() @ R
         direction = (direction + shift) / np.linalg.norm(direction + shift)
     return R, direction

@@ -31,7 +31,9 @@ LOOP_SOURCE = "loop"  # the ``source`` of relative poses that close a loop: the 
 KEYFRAME_SOURCE = "window"  # in metrics.json
 _TRUSTED_HEIGHTS = 30.0  # largest learned depth that is used, in camera heights
 _SURFACE_STEP = 0.12  # relative depth step between neighbouring pixels of one surface
-_TIE_PX = np.float32(1e-3)  # of two pixels equally near that right and below, on a road the nearer one
+_TIE_PX = np.float32(
+    1e-3
+)  # of two pixels equally near that right and below, on a road the nearer one
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,9 @@ class Frame:
     @property
     def grey(self) -> Grey:
         """Grey levels ``(H, W)`` uint8."""
-        return self.derived("grey", lambda: np.asarray(cv2.cvtColor(self.image, cv2.COLOR_RGB2GRAY), np.uint8))
+        return self.derived(
+            "grey", lambda: np.asarray(cv2.cvtColor(self.image, cv2.COLOR_RGB2GRAY), np.uint8)
+        )
 
 
 class Sequence(Protocol):
@@ -210,7 +214,9 @@ class RelativePose:
         T_from_to[:3, 3] *= scale
         units = np.repeat([1.0, scale], 3)
         correlated = None if self.correlated_sigmas is None else self.correlated_sigmas * units
-        return replace(self, T_from_to=T_from_to, sigmas=self.sigmas * units, correlated_sigmas=correlated)
+        return replace(
+            self, T_from_to=T_from_to, sigmas=self.sigmas * units, correlated_sigmas=correlated
+        )
 
     @property
     def graph_sigmas(self) -> FloatArray:
@@ -294,7 +300,10 @@ def sampled_depth(depth: DepthMap, u: NDArray[np.float32], v: NDArray[np.float32
     np.divide(1, depth, out=inverse, where=known)
     pixels = np.ones((2, 2), np.uint8)  # this one, and those right and below
     column, row = np.floor(u), np.floor(v)
-    least, most = (_nearest(bound(inverse, pixels, anchor=(0, 0)), column, row) for bound in (cv2.erode, cv2.dilate))
+    least, most = (
+        _nearest(bound(inverse, pixels, anchor=(0, 0)), column, row)
+        for bound in (cv2.erode, cv2.dilate)
+    )
     between = cv2.remap(inverse, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     sampled = _nearest(depth, u + _TIE_PX, v + _TIE_PX)
     is_one_surface = (least > 0) & (most <= (1 + _SURFACE_STEP) * least)
@@ -319,8 +328,14 @@ def resized_mask(mask: Mask, width: int, height: int) -> Mask:
 
 def slopes_of(image: NDArray[np.float32]) -> list[NDArray[np.float32]]:
     """Derivatives of an image ``(H, W)`` along its rows and columns, grey levels a pixel."""
-    return [np.asarray(cv2.Sobel(image, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8)) for dx in (1, 0)]
+    return [
+        np.asarray(cv2.Sobel(image, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8)) for dx in (1, 0)
+    ]
 
 
-def _nearest(values: NDArray[np.float32], u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.asarray(cv2.remap(values, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE), np.float32)
+def _nearest(
+    values: NDArray[np.float32], u: NDArray[np.float32], v: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    return np.asarray(
+        cv2.remap(values, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE), np.float32
+    )

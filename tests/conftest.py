@@ -19,7 +19,9 @@ for _threads in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[_threads] = "1"
 os.environ["MPLBACKEND"] = "Agg"
 # The font cache is costly to build: it outlives the session, unlike the home folder below.
-os.environ.setdefault("MPLCONFIGDIR", str(Path(tempfile.gettempdir()) / f"erfsfm-slam-matplotlib-{os.getuid()}"))
+os.environ.setdefault(
+    "MPLCONFIGDIR", str(Path(tempfile.gettempdir()) / f"erfsfm-slam-matplotlib-{os.getuid()}")
+)
 
 # Torch and two thousand tests stay for the session: no collection of garbage looks through them again.
 gc.disable()
@@ -39,7 +41,9 @@ def pytest_collection_finish() -> None:
 @pytest.fixture
 def as_in_the_foreground() -> Generator[None]:
     """What a shell starts in the background ignores SIGINT; nohup ignores SIGHUP."""
-    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGTERM, signal.SIGHUP)}
+    before = {
+        number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGTERM, signal.SIGHUP)
+    }
     before[signal.SIGINT] = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     for number, handler in before.items():
@@ -95,9 +99,15 @@ def data_root() -> Path:
     return root
 
 
-_A = dict.fromkeys(("ate_rmse_m", "t_rel_percent", "r_rel_deg_per_100m", "rpe_trans_m", "rpe_rot_deg", "scale"), float)
+_A = dict.fromkeys(
+    ("ate_rmse_m", "t_rel_percent", "r_rel_deg_per_100m", "rpe_trans_m", "rpe_rot_deg", "scale"),
+    float,
+)
 _T = {
-    "snippet5": {**dict.fromkeys(("ate_mean", "ate_std", "re_mean", "re_std"), float), "count": int},
+    "snippet5": {
+        **dict.fromkeys(("ate_mean", "ate_std", "re_mean", "re_std"), float),
+        "count": int,
+    },
     "align": dict.fromkeys(("none", "first", "scale", "6dof", "7dof"), _A),
     "evo": dict.fromkeys(("ape_rmse_m_7dof", "rpe_trans_m", "rpe_rot_deg", "difference"), float),
 }
@@ -116,7 +126,9 @@ _METRICS = {
     "provenance": _PROVENANCE,
     "sequence": {"name": str, "frames": int, "length_m": float, "fps": float},
     "timing": {
-        **dict.fromkeys(("seconds_total", "frames_per_second", "cpu_seconds", "peak_rss_mb"), float),
+        **dict.fromkeys(
+            ("seconds_total", "frames_per_second", "cpu_seconds", "peak_rss_mb"), float
+        ),
         "stages": dict,
     },
     "scale": {"mode": str, "value": float},
@@ -132,16 +144,32 @@ _METRICS = {
     },
 }
 # never null
-_ALWAYS = {"schema", "status", "provenance", "frames", "name", "timing", "mode", "nodes", "factors", *_PROVENANCE}
+_ALWAYS = {
+    "schema",
+    "status",
+    "provenance",
+    "frames",
+    "name",
+    "timing",
+    "mode",
+    "nodes",
+    "factors",
+    *_PROVENANCE,
+}
 _STEMS = ("trajectory_network", "trajectory_odometry", "trajectory_optimised")
-_FILES = (*("config.yaml", "metrics.json", "graph.g2o", "loops.json", "places.npz"), *("report.html", "run.log"))
+_FILES = (
+    *("config.yaml", "metrics.json", "graph.g2o", "loops.json", "places.npz"),
+    *("report.html", "run.log"),
+)
 _MAP_FILES = ("map_mesh.ply", "map_cloud.ply")
 
 
 def _violations(node: Any, wanted: Any, where: str) -> list[str]:
     """Violations of the schema of ``metrics.json`` in one of its parts."""
     if not isinstance(wanted, Mapping):
-        right = isinstance(node, (int, float) if wanted is float else wanted) and (wanted is bool or node is not True)
+        right = isinstance(node, (int, float) if wanted is float else wanted) and (
+            wanted is bool or node is not True
+        )
         return [] if right else [f"{where} is {node!r}, not {wanted.__name__}"]
     if not isinstance(node, dict):
         return [f"{where} is {node!r}, not an object"]
@@ -167,14 +195,20 @@ def check_run() -> Callable[[Path], dict[str, Any]]:
         def refuse(word: str) -> None:
             raise AssertionError(f"metrics.json holds {word}")
 
-        metrics: dict[str, Any] = json.loads((path / "metrics.json").read_text(), parse_constant=refuse)
+        metrics: dict[str, Any] = json.loads(
+            (path / "metrics.json").read_text(), parse_constant=refuse
+        )
         assert _violations(metrics, _METRICS, "metrics") == []
         assert (metrics["schema"], metrics["status"]) == (1, "ok")
         maps = _MAP_FILES if metrics["map"]["triangles"] else ()
         stems = (*_STEMS, "reference") if metrics["sequence"]["length_m"] is not None else _STEMS
         if metrics["trajectories"]["lidar"] is not None:
             maps = (*maps, "trajectory_lidar.kitti.txt", "trajectory_lidar.tum.txt")
-        wanted = {*_FILES, *maps, *(f"{stem}.{kind}.txt" for stem in stems for kind in ("kitti", "tum"))}
+        wanted = {
+            *_FILES,
+            *maps,
+            *(f"{stem}.{kind}.txt" for stem in stems for kind in ("kitti", "tum")),
+        }
         assert {file.name for file in path.iterdir()} == wanted
         for stem in stems:
             rows = np.loadtxt(path / f"{stem}.kitti.txt", ndmin=2)
@@ -193,5 +227,7 @@ def check_run() -> Callable[[Path], dict[str, Any]]:
 def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """What damaged files make programs say may hold characters that xdist cannot send to its other processes."""
     report = yield
-    report.sections = [(name, said.encode("utf-8", "backslashreplace").decode()) for name, said in report.sections]
+    report.sections = [
+        (name, said.encode("utf-8", "backslashreplace").decode()) for name, said in report.sections
+    ]
     return report

@@ -105,7 +105,9 @@ class _Stream(IntEnum):
     POSE = 2
 
 
-def snippets_of(T_world_camera: FloatArray, sources: int = 4, unusable: Collection[int] = ()) -> list[SnippetPoses]:
+def snippets_of(
+    T_world_camera: FloatArray, sources: int = 4, unusable: Collection[int] = ()
+) -> list[SnippetPoses]:
     """True snippets, one for each target whose frames are all usable."""
     found, half = [], sources // 2
     for target in range(half, len(T_world_camera) - half):

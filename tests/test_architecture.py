@@ -31,8 +31,7 @@ LOADERS: dict[str, Callable[[str], object]] = {
     "slam": load_config,
     "splits": read_split_file,
 }
-MOST_LINES = 500
-MOST_FUNCTION_LINES = 60
+MOST_FUNCTION_LINES = 60  # after the docstring
 MOST_PARAMETERS = 9
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
@@ -83,17 +82,21 @@ def parameters(function: Function) -> int:
 def test_every_module_and_public_name_says_what_it_is() -> None:
     silent = [name for name in SOURCES if not ast.get_docstring(tree_of(name))]
     silent += [
-        f"{name}:{node.name}" for name in SOURCES for node in public(tree_of(name).body) if not ast.get_docstring(node)
+        f"{name}:{node.name}"
+        for name in SOURCES
+        for node in public(tree_of(name).body)
+        if not ast.get_docstring(node)
     ]
     assert not silent
 
 
-def test_files_and_functions_are_short_and_take_few_parameters() -> None:
-    over = {name for name, text in SOURCES.items() if text.count("\n") > MOST_LINES}
+def test_functions_are_short_and_take_few_parameters() -> None:
+    over = set()
     for name in SOURCES:
         for node in nodes(name):
             if isinstance(node, Function):
-                lines = (node.end_lineno or 0) - node.lineno + 1
+                documented = ast.get_docstring(node) is not None and len(node.body) > 1
+                lines = (node.end_lineno or 0) - node.body[documented].lineno + 1
                 if lines > MOST_FUNCTION_LINES or parameters(node) > MOST_PARAMETERS:
                     over.add(f"{name}:{node.name}")
     assert not over
@@ -104,7 +107,9 @@ def test_only_command_lines_and_tools_print() -> None:
         name
         for name in MODULES
         for node in nodes(name)
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and node.func.id == "print"
     }
     assert calls <= {"erfsfm/cli.py", "slam/commands/cli.py"}
 
@@ -126,7 +131,12 @@ def test_no_module_is_named_like_one_of_python_and_every_folder_is_a_package() -
 
 
 def test_the_package_shows_its_doors_alone() -> None:
-    assert {name for name in dir(slam) if not name.startswith("__")} == {"RunFolder", "Slam", "load_config", "run_slam"}
+    assert {name for name in dir(slam) if not name.startswith("__")} == {
+        "RunFolder",
+        "Slam",
+        "load_config",
+        "run_slam",
+    }
 
 
 def test_both_packages_are_of_one_distribution_and_one_place() -> None:
@@ -139,7 +149,9 @@ def test_both_packages_are_of_one_distribution_and_one_place() -> None:
 def test_git_ignores_no_source() -> None:
     """A pattern such as ``results/`` would also keep ``slam/results/`` out of commits and out of the wheel."""
     command = ["git", "check-ignore", "--no-index", "--stdin"]
-    listed = subprocess.run(command, cwd=ROOT, input="\n".join(SOURCES), capture_output=True, text=True, check=False)
+    listed = subprocess.run(
+        command, cwd=ROOT, input="\n".join(SOURCES), capture_output=True, text=True, check=False
+    )
     if listed.returncode == 128:
         pytest.skip("not a git checkout")
     assert listed.stdout == ""
@@ -148,7 +160,11 @@ def test_git_ignores_no_source() -> None:
 def test_every_configuration_loads_by_file_and_by_name() -> None:
     files = list((ROOT / "configs").rglob("*.yaml"))
     assert {path.parent.name for path in files} == set(LOADERS)
-    assert not [path for path in files if LOADERS[path.parent.name](str(path)) != LOADERS[path.parent.name](path.stem)]
+    assert not [
+        path
+        for path in files
+        if LOADERS[path.parent.name](str(path)) != LOADERS[path.parent.name](path.stem)
+    ]
 
 
 def test_no_tracked_text_names_a_place_on_one_machine() -> None:

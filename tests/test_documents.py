@@ -21,15 +21,23 @@ sys.path.insert(0, str(ROOT / "tools"))
 docs_site = importlib.import_module("docs_site")
 DOCS = sorted((ROOT / "docs").rglob("*.md"))
 # the record of a network's training and the list of changes name what there was
-PAGES = {path: path.read_text(encoding="utf-8") for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS)}
-LINKED = PAGES | {path: path.read_text() for path in (ROOT / "CHANGELOG.md", *ROOT.glob("erfsfm/weights/*/README.md"))}
+PAGES = {
+    path: path.read_text(encoding="utf-8")
+    for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS)
+}
+LINKED = PAGES | {
+    path: path.read_text()
+    for path in (ROOT / "CHANGELOG.md", *ROOT.glob("erfsfm/weights/*/README.md"))
+}
 PROGRAMS: dict[str, Any] = {
     "erfsfm": typer.main.get_command(erfsfm.cli.app),
     "erfsfm-slam": typer.main.get_command(slam.commands.cli.app),
 }
 LINK = re.compile(r"\]\((?!https?:)([^)\s#]*)(?:#([^)\s]*))?\)")
 KINDS = ("slam", "erfsfm", "tools", "tests", "configs")
-FILE = re.compile(r"(?<![\w./-])(?:slam|erfsfm|tools|tests|configs|docs)/[\w./-]*\.(?:py|yaml|md)\b")
+FILE = re.compile(
+    r"(?<![\w./-])(?:slam|erfsfm|tools|tests|configs|docs)/[\w./-]*\.(?:py|yaml|md)\b"
+)
 KEYS = {
     f"{section}.{key}"
     for model in (SlamConfig, ExperimentConfig)
@@ -58,12 +66,24 @@ def test_links_lead_to_pages_and_headings() -> None:
 
 def test_files_and_configuration_keys_that_are_named_exist() -> None:
     strange = []
-    paths = [f"/{path.relative_to(ROOT).as_posix()}" for kind in KINDS for path in (ROOT / kind).rglob("*.py")]
+    paths = [
+        f"/{path.relative_to(ROOT).as_posix()}"
+        for kind in KINDS
+        for path in (ROOT / kind).rglob("*.py")
+    ]
     for page, text in PAGES.items():
-        strange += [f"{page.name}: {name}" for name in FILE.findall(text) if not (ROOT / name).exists()]
+        strange += [
+            f"{page.name}: {name}" for name in FILE.findall(text) if not (ROOT / name).exists()
+        ]
         modules = re.findall(r"`([a-z_0-9/]+\.py)`", text)
-        strange += [f"{page.name}: {name}" for name in modules if not any(f"/{name}" in path for path in paths)]
-        named = {key for part in re.findall(r"`[^`]+`|--set \S+", text) for key in KEY.findall(part)}
+        strange += [
+            f"{page.name}: {name}"
+            for name in modules
+            if not any(f"/{name}" in path for path in paths)
+        ]
+        named = {
+            key for part in re.findall(r"`[^`]+`|--set \S+", text) for key in KEY.findall(part)
+        }
         strange += [f"{page.name}: {key}" for key in named - KEYS]
     assert not strange
 
@@ -73,7 +93,9 @@ def test_pages_that_code_names_exist() -> None:
     for path in (each for kind in KINDS for each in (ROOT / kind).rglob("*")):
         if path.suffix in {".py", ".yaml", ".md", ".j2"}:
             named = re.findall(r"\bdocs/[\w/-]+\.md\b", path.read_text(encoding="utf-8"))
-            missing += [f"{path.relative_to(ROOT)}: {name}" for name in named if not (ROOT / name).is_file()]
+            missing += [
+                f"{path.relative_to(ROOT)}: {name}" for name in named if not (ROOT / name).is_file()
+            ]
     assert not missing
 
 
@@ -81,9 +103,12 @@ def test_the_index_and_the_site_have_every_page_once() -> None:
     docs, index = ROOT / "docs", ROOT / "docs" / "README.md"
     listed = {(docs / target).resolve() for target, _ in LINK.findall(PAGES[index])}
     assert listed == {*DOCS, *docs.rglob("*.ipynb")} - {index}
-    nav = re.findall(r"^ +- (?:.+: )?(\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
+    nav = re.findall(
+        r"^ +- (?:.+: )?(\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE
+    )
     assert sorted(nav) == sorted(
-        {path.relative_to(docs).as_posix() for path in DOCS} - {"README.md"} | set(docs_site.pages())
+        {path.relative_to(docs).as_posix() for path in DOCS} - {"README.md"}
+        | set(docs_site.pages())
     )
 
 

@@ -48,9 +48,20 @@ _BOTH = ("loop", "straight")
 # options of paths, which the page calls by these names
 _PATHS = ("report", "kitti", "data", *handheld.ROOTS, "output", "worlds_in", "against")
 MODES = {
-    "accuracy": Mode("errors of all trajectories", p.ACCURACY, _BOTH, (610, 611), ("default", "sim"), (0, 1, 2)),
-    "full-size": Mode("the same at 1242x375, on worlds and on original images of KITTI", p.ACCURACY, _BOTH, (610, 611)),
-    "maps": Mode("errors, size and cost of the map, with one of its parts turned off at a time", p.MAPS, ("loop",)),
+    "accuracy": Mode(
+        "errors of all trajectories", p.ACCURACY, _BOTH, (610, 611), ("default", "sim"), (0, 1, 2)
+    ),
+    "full-size": Mode(
+        "the same at 1242x375, on worlds and on original images of KITTI",
+        p.ACCURACY,
+        _BOTH,
+        (610, 611),
+    ),
+    "maps": Mode(
+        "errors, size and cost of the map, with one of its parts turned off at a time",
+        p.MAPS,
+        ("loop",),
+    ),
     "handheld": Mode("errors, losses and waits of cameras that are carried", p.ACCURACY, ()),
 }
 
@@ -70,7 +81,9 @@ def main(words: Sequence[str] | None = None) -> None:
     results = p.measured(jobs, options.jobs, options.scheduler)
     table_of_runs = rows(results, handheld.DEFINITIONS if options.mode == "handheld" else ())
     write_atomically(options.output / f"{options.mode}.csv", csv_of(table_of_runs))
-    text = page.section(options.mode, command, results, "several" if options.scheduler else str(options.jobs))
+    text = page.section(
+        options.mode, command, results, "several" if options.scheduler else str(options.jobs)
+    )
     _write_section(options, text)
     print(text)
     if options.mode == "accuracy" and page.drawable(results):
@@ -82,7 +95,11 @@ def _write_section(options: argparse.Namespace, text: str) -> None:
     """Into the page, with names in place of the paths of one machine."""
     folders = [*getattr(options, "drives", ()), *getattr(options, "folders", ())]
     known = [(getattr(options, name, None), name.upper()) for name in _PATHS]
-    for path, name in (*known, *((folder.parent, folder.parent.name) for folder in folders), (p.ROOT, ".")):
+    for path, name in (
+        *known,
+        *((folder.parent, folder.parent.name) for folder in folders),
+        (p.ROOT, "."),
+    ):
         for written in (str(path.resolve()), str(path)) if path else ():
             text = text.replace(written, name)
     report: Path = options.report
@@ -116,21 +133,29 @@ def _compare_speed(options: argparse.Namespace, command: str) -> None:
 def _jobs(options: argparse.Namespace) -> list[p.Job]:
     folder = options.output.resolve() / options.mode / p.revision()
     simulated = (options.worlds_in or options.output / "worlds").resolve()
-    of_worlds = {"maps": ("--depth",), "full-size": ("--width", "1242", "--height", "375")}.get(options.mode, ())
+    of_worlds = {"maps": ("--depth",), "full-size": ("--width", "1242", "--height", "375")}.get(
+        options.mode, ()
+    )
     if options.mode == "handheld":
         drives = handheld.drives(options, simulated)
     else:
-        drives = p.worlds(simulated, options.routes, options.worlds, options.frames, options.conditions, of_worlds)
+        drives = p.worlds(
+            simulated, options.routes, options.worlds, options.frames, options.conditions, of_worlds
+        )
     drives += p.raw_drives(getattr(options, "drives", ()))
     if getattr(options, "kitti", None) is not None:
         drives += p.recordings(options.kitti.resolve(), options.sequences, options.excerpt)
     if getattr(options, "data", None) is not None:
-        drives += [d for root in p.ORIGINALS for d in p.recordings(options.data.resolve() / root, (), None)]
+        drives += [
+            d for root in p.ORIGINALS for d in p.recordings(options.data.resolve() / root, (), None)
+        ]
     configurations = MODES[options.mode].configurations
     parts = getattr(options, "parts", None)
     if parts is not None:
         configurations = {name: configurations[name] for name in (p.EVERYTHING, *parts)}
-    return p.plan(folder, drives, configurations, options.weights, options.seeds, options.set, options.device)
+    return p.plan(
+        folder, drives, configurations, options.weights, options.seeds, options.set, options.device
+    )
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -140,18 +165,40 @@ def _parser() -> argparse.ArgumentParser:
     def options_of(name: str, what: str) -> Callable[..., object]:
         show = argparse.ArgumentDefaultsHelpFormatter
         add = modes.add_parser(name, help=what, description=what, formatter_class=show).add_argument
-        add("--output", type=Path, default=Path("runs/benchmark"), help="keeps runs, worlds and CSV files")
-        add("--report", type=Path, default=Path("docs/benchmarks.md"), help="the page whose section is written")
+        add(
+            "--output",
+            type=Path,
+            default=Path("runs/benchmark"),
+            help="keeps runs, worlds and CSV files",
+        )
+        add(
+            "--report",
+            type=Path,
+            default=Path("docs/benchmarks.md"),
+            help="the page whose section is written",
+        )
         return add
 
     for name, mode in MODES.items():
         add = options_of(name, mode.what)
         if name == "full-size":
             data = os.environ.get("ERFSFM_DATA")
-            add("--data", type=Path, default=data and Path(data), metavar="FOLDER", help="recordings; $ERFSFM_DATA")
+            add(
+                "--data",
+                type=Path,
+                default=data and Path(data),
+                metavar="FOLDER",
+                help="recordings; $ERFSFM_DATA",
+            )
         elif name != "handheld":
             add("--kitti", type=Path, metavar="ROOT", help="a KITTI odometry root to measure")
-            add("--sequences", nargs="+", default=(), metavar="NAME", help="of that root; all of them without it")
+            add(
+                "--sequences",
+                nargs="+",
+                default=(),
+                metavar="NAME",
+                help="of that root; all of them without it",
+            )
         if name == "handheld":
             handheld.add_options(add)
         else:
@@ -159,24 +206,68 @@ def _parser() -> argparse.ArgumentParser:
             add("--worlds", nargs="+", type=int, default=mode.worlds, help="their seeds")
             add("--frames", type=int, default=300, help="their length")
             add(
-                "--conditions", nargs="+", choices=get_args(p.Condition), default=["clean"], help="hazards: all at once"
+                "--conditions",
+                nargs="+",
+                choices=get_args(p.Condition),
+                default=["clean"],
+                help="hazards: all at once",
             )
-        add("--worlds-in", type=Path, metavar="FOLDER", help="where they are or will be; OUTPUT/worlds without it")
+        add(
+            "--worlds-in",
+            type=Path,
+            metavar="FOLDER",
+            help="where they are or will be; OUTPUT/worlds without it",
+        )
         add("--weights", nargs="+", default=mode.weights, help="names or folders")
         add("--seeds", nargs="+", type=int, default=mode.seeds, help="of the RANSAC draws")
-        add("--set", nargs="+", default=(), metavar="KEY=VALUE", help="changes to every configuration")
-        add("--device", choices=("auto", "cpu", "cuda"), default="cpu", help="where the networks compute")
+        add(
+            "--set",
+            nargs="+",
+            default=(),
+            metavar="KEY=VALUE",
+            help="changes to every configuration",
+        )
+        add(
+            "--device",
+            choices=("auto", "cpu", "cuda"),
+            default="cpu",
+            help="where the networks compute",
+        )
         if name in ("accuracy", "maps"):
             add("--excerpt", metavar="A:B", help="frames of the sequences of --kitti, half-open")
         if name == "maps":
-            add("--drives", nargs="+", type=Path, default=(), metavar="FOLDER", help="KITTI raw drives")
+            add(
+                "--drives",
+                nargs="+",
+                type=Path,
+                default=(),
+                metavar="FOLDER",
+                help="KITTI raw drives",
+            )
             parts = [part for part in mode.configurations if part != p.EVERYTHING]
-            add("--parts", nargs="*", choices=parts, metavar="PART", help=f"to turn off: {', '.join(parts)}; else all")
+            add(
+                "--parts",
+                nargs="*",
+                choices=parts,
+                metavar="PART",
+                help=f"to turn off: {', '.join(parts)}; else all",
+            )
         add("--jobs", type=int, default=1, help="runs at a time; more than one needs Dask")
         add("--scheduler", metavar="ADDRESS", help="of a Dask cluster in place of local processes")
     add = options_of("speed", "time, memory and stages of two checkouts in turn")
-    add("--against", type=Path, required=True, metavar="CHECKOUT", help="the other checkout, run before this one")
-    add("--kitti", type=Path, metavar="ROOT", help="a KITTI odometry root, run with its map and without")
+    add(
+        "--against",
+        type=Path,
+        required=True,
+        metavar="CHECKOUT",
+        help="the other checkout, run before this one",
+    )
+    add(
+        "--kitti",
+        type=Path,
+        metavar="ROOT",
+        help="a KITTI odometry root, run with its map and without",
+    )
     add("--sequence", default="05", help="of that root")
     add("--folders", nargs="*", type=Path, default=(), metavar="FOLDER", help="folders of images")
     add("--frames", type=int, default=2000, help="of a simulated grid; 0 leaves it out")

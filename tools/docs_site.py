@@ -48,7 +48,15 @@ INTERFACE = {
     "slam.formats.trajectory": ("Trajectory", "read_trajectory", "write_kitti", "write_tum"),
     "slam.evaluation.trajectory": ("trajectory_metrics", "align"),
     "slam.pipeline.live": ("LivePose",),
-    "slam.frames": ("Intrinsics", "Frame", "Sequence", "Predictor", "SnippetPoses", "RelativePose", "View"),
+    "slam.frames": (
+        "Intrinsics",
+        "Frame",
+        "Sequence",
+        "Predictor",
+        "SnippetPoses",
+        "RelativePose",
+        "View",
+    ),
     "slam.sequences.catalogue": ("open_sequence",),
     "slam.sequences.recording": ("RecordedSequence", "Source"),
     "slam.sequences.loader": ("Loader",),
@@ -56,7 +64,10 @@ INTERFACE = {
     "erfsfm.inference": ("DepthPosePredictor",),
 }
 # of names that have other members for the program itself
-MEMBERS = {"RunFolder": ["open", "metrics", "trajectory", "mesh", "cloud", "keyframes"], "RunRequest": []}
+MEMBERS = {
+    "RunFolder": ["open", "metrics", "trajectory", "mesh", "cloud", "keyframes"],
+    "RunRequest": [],
+}
 
 
 def main() -> None:
@@ -64,12 +75,23 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--output", type=Path, default=Path("site"), help="the folder to write")
     output: Path = parser.parse_args().output
-    os.environ.setdefault("NO_MKDOCS_2_WARNING", "1")  # about versions that constraints.txt rules out
+    os.environ.setdefault(
+        "NO_MKDOCS_2_WARNING", "1"
+    )  # about versions that constraints.txt rules out
     try:
         from mkdocs.__main__ import cli
     except ModuleNotFoundError as error:
         raise SystemExit(f"{error.name} is not installed: run make docs") from error
-    cli(["build", "--strict", "--config-file", str(ROOT / "mkdocs.yml"), "--site-dir", str(output.resolve())])
+    cli(
+        [
+            "build",
+            "--strict",
+            "--config-file",
+            str(ROOT / "mkdocs.yml"),
+            "--site-dir",
+            str(output.resolve()),
+        ]
+    )
 
 
 def on_config(config: MkDocsConfig) -> None:
@@ -108,8 +130,12 @@ def pages() -> dict[str, str]:
     for source, place in PLACES.items():
         elsewhere[place] = text = (ROOT / source).read_text(encoding="utf-8")
         if source.endswith(".ipynb"):
-            cells = [(cell["cell_type"], "".join(cell["source"])) for cell in json.loads(text)["cells"]]
-            parts = [text if kind == "markdown" else f"```python\n{text}\n```" for kind, text in cells]
+            cells = [
+                (cell["cell_type"], "".join(cell["source"])) for cell in json.loads(text)["cells"]
+            ]
+            parts = [
+                text if kind == "markdown" else f"```python\n{text}\n```" for kind, text in cells
+            ]
             elsewhere[place] = "\n\n".join(parts)
     return elsewhere | {"command-line.md": command_line(), "python.md": interface()}
 
@@ -119,10 +145,17 @@ def command_line() -> str:
     text = "# Command line\n\n"
     for name, app in PROGRAMS.items():
         command = typer.main.get_command(app)
-        text += typer.cli.get_docs_for_click(obj=command, ctx=typer.Context(command), name=name, indent=1) + "\n"
+        text += (
+            typer.cli.get_docs_for_click(
+                obj=command, ctx=typer.Context(command), name=name, indent=1
+            )
+            + "\n"
+        )
     text = re.sub(r"\*\*Commands\*\*:\n\n(\* .*\n)+|\* `--help`: .*\n", "", text)
     text = re.sub(r"^Example: (.+)$", r"```sh\n\1\n```", text, flags=re.MULTILINE)
-    text = re.sub(r"(```.*?```|`[^`\n]*`)|<", lambda found: found[1] or "&lt;", text, flags=re.DOTALL)
+    text = re.sub(
+        r"(```.*?```|`[^`\n]*`)|<", lambda found: found[1] or "&lt;", text, flags=re.DOTALL
+    )
     return re.sub(r"docs/([\w/-]+)\.md", r"[\1](\1.md)", text)
 
 

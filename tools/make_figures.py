@@ -35,8 +35,18 @@ from slam.sequences.catalogue import open_sequence
 WIDTH_PX = 1600
 SEAT_PX = 1280, 720
 MOST_TRIANGLES = 4_000_000
-STYLE: dict[str, Any] = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True}
-STYLE |= {"axes.axisbelow": True, "grid.color": "#e3e6ea", "legend.fontsize": 9, "legend.frameon": False}
+STYLE: dict[str, Any] = {
+    "font.size": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+}
+STYLE |= {
+    "axes.axisbelow": True,
+    "grid.color": "#e3e6ea",
+    "legend.fontsize": 9,
+    "legend.frameon": False,
+}
 SKY = (226, 232, 239)
 _DASHES = {"dash": "dashed", "dot": "dotted"}
 
@@ -50,7 +60,9 @@ def main() -> None:
     parser.add_argument("--dataset", type=Path, help="of the run; default: the embedded sequence")
     parser.add_argument("--sequence")
     parser.add_argument("--weights", default="default")
-    parser.add_argument("--seat", type=int, nargs="+", metavar="FRAME", help="the map as these see it, below them")
+    parser.add_argument(
+        "--seat", type=int, nargs="+", metavar="FRAME", help="the map as these see it, below them"
+    )
     arguments = parser.parse_args()
 
     folder = RunFolder.open(arguments.run)
@@ -62,22 +74,34 @@ def main() -> None:
         if picture.shape[1] > WIDTH_PX:
             picture = narrowed(picture, WIDTH_PX)
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    small = [cv2.IMWRITE_PNG_COMPRESSION, 9] if arguments.output.suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, 85]
+    small = (
+        [cv2.IMWRITE_PNG_COMPRESSION, 9]
+        if arguments.output.suffix == ".png"
+        else [cv2.IMWRITE_JPEG_QUALITY, 85]
+    )
     cv2.imwrite(str(arguments.output), picture[..., ::-1], small)
-    print(f"{arguments.output}: {picture.shape[1]}x{picture.shape[0]}, {arguments.output.stat().st_size / 1e3:.0f} kB")
+    print(
+        f"{arguments.output}: {picture.shape[1]}x{picture.shape[0]}, {arguments.output.stat().st_size / 1e3:.0f} kB"
+    )
 
 
 def seat(folder: RunFolder, sequence: Sequence, frame: int) -> NDArray[np.uint8]:
     """A frame above what a camera at its place sees of the map."""
     T_world_camera = trajectories_of(folder)["optimised"].T_world_camera[frame]
-    u, v = np.meshgrid(np.arange(SEAT_PX[0]) - 0.5 * SEAT_PX[0], np.arange(SEAT_PX[1]) - 0.5 * SEAT_PX[1])
+    u, v = np.meshgrid(
+        np.arange(SEAT_PX[0]) - 0.5 * SEAT_PX[0], np.arange(SEAT_PX[1]) - 0.5 * SEAT_PX[1]
+    )
     rays = np.stack([u, v, np.full_like(u, SEAT_PX[1])], axis=-1) @ T_world_camera[:3, :3].T
-    below = cast(thinned_mesh(folder.require(MAP_MESH), MOST_TRIANGLES), T_world_camera[:3, 3], rays)
+    below = cast(
+        thinned_mesh(folder.require(MAP_MESH), MOST_TRIANGLES), T_world_camera[:3, 3], rays
+    )
     image = sequence.frame(frame).image
     return np.concatenate([narrowed(image, below.shape[1]), below])
 
 
-def overview(folder: RunFolder, sequence: Sequence, predictor: DepthPosePredictor) -> NDArray[np.uint8]:
+def overview(
+    folder: RunFolder, sequence: Sequence, predictor: DepthPosePredictor
+) -> NDArray[np.uint8]:
     """Depth of some frames above the trajectories and the map."""
     chosen = np.linspace(0, len(sequence) - 1, 5).round().astype(int)[1:-1]
     images = [sequence.frame(int(k)).image for k in chosen]
@@ -98,7 +122,9 @@ def overview(folder: RunFolder, sequence: Sequence, predictor: DepthPosePredicto
 
 def above(mesh: MapMesh, width: int) -> NDArray[np.uint8]:
     """The map from above; z ahead is up."""
-    (x0, z0), (x1, z1) = (np.percentile(mesh.points[:, [0, 2]], percent, axis=0) for percent in (0.5, 99.5))
+    (x0, z0), (x1, z1) = (
+        np.percentile(mesh.points[:, [0, 2]], percent, axis=0) for percent in (0.5, 99.5)
+    )
     x, z = np.meshgrid(np.linspace(x0, x1, width), np.arange(z1, z0, -(x1 - x0) / width))
     origins = np.stack([x, np.full_like(x, mesh.points[:, 1].min() - 1.0), z], axis=-1)
     return cast(mesh, origins, np.array([0.0, 1.0, 0.0]))
@@ -110,12 +136,18 @@ def trajectories_of(folder: RunFolder) -> dict[str, Trajectory]:
     return {name: trajectory for name, trajectory in found.items() if trajectory is not None}
 
 
-def draw_trajectories(canvas: FigureBase, trajectories: Mapping[str, Trajectory], unit: str) -> Axes:
+def draw_trajectories(
+    canvas: FigureBase, trajectories: Mapping[str, Trajectory], unit: str
+) -> Axes:
     """Draw them on a figure or a part of one, aligned to the reference where there is one."""
     axes = canvas.subplots()
     for name, trajectory in aligned(trajectories).items():
         label, colour, width, dash = LOOKS[name]
-        look: dict[str, Any] = {"color": colour or "black", "linewidth": width, "linestyle": _DASHES.get(dash, dash)}
+        look: dict[str, Any] = {
+            "color": colour or "black",
+            "linewidth": width,
+            "linestyle": _DASHES.get(dash, dash),
+        }
         axes.plot(trajectory.positions[:, 0], trajectory.positions[:, 2], label=label, **look)
     axes.set(xlabel=f"x, right ({unit})", ylabel=f"z, ahead ({unit})")
     axes.set_aspect("equal", adjustable="datalim")
@@ -143,7 +175,9 @@ def cast(mesh: MapMesh, origins: FloatArray, directions: FloatArray) -> NDArray[
 def _padded(picture: NDArray[np.uint8], height: int) -> NDArray[np.uint8]:
     """The picture centred on white of a given height."""
     missing = height - picture.shape[0]
-    return np.pad(picture, ((missing // 2, missing - missing // 2), (0, 0), (0, 0)), constant_values=255)
+    return np.pad(
+        picture, ((missing // 2, missing - missing // 2), (0, 0), (0, 0)), constant_values=255
+    )
 
 
 if __name__ == "__main__":

@@ -61,7 +61,9 @@ def paper_rows(patterns: Sequence[str]) -> list[Row]:
         first, *rest = cells.split(" | ")
         has_scale = first in ("GT", "PoseNet")
         if any(fnmatch(name, pattern) for pattern in patterns):
-            rows.append(Row(name, first if has_scale else "", tuple(rest) if has_scale else (first, *rest)))
+            rows.append(
+                Row(name, first if has_scale else "", tuple(rest) if has_scale else (first, *rest))
+            )
     if not rows:
         raise ConfigError(f"{' '.join(patterns)} names no training of {GUIDE.name}")
     return rows
@@ -73,7 +75,9 @@ class Training:
     def __init__(self, name: str, output: Path, kitti: Path, changes: Sequence[str]) -> None:
         self.name, self.folder = name, output / name
         self.config = load_experiment(name, changes).with_roots([kitti])
-        self.frames = output / "frames" / f"{self.config.network.width}x{self.config.network.height}"
+        self.frames = (
+            output / "frames" / f"{self.config.network.width}x{self.config.network.height}"
+        )
 
     def steps_left(self) -> int:
         """After its latest weights."""
@@ -91,7 +95,12 @@ class Training:
             config = _changed(self.config, "data", roots=[frames], validation=[])
             config = _changed(config, "training", steps=_FIRST_STEPS + _TIMED_STEPS)
             run = Path(temporary) / "run"
-            train(config, run, device=device, progress=lambda _, done, __: done_at.update({done: time.monotonic()}))
+            train(
+                config,
+                run,
+                device=device,
+                progress=lambda _, done, __: done_at.update({done: time.monotonic()}),
+            )
         return (done_at[max(done_at)] - done_at[_FIRST_STEPS]) / _TIMED_STEPS
 
     def run(self, device: str, progress: Progress) -> None:
@@ -123,7 +132,9 @@ def ours(row: Row, results: Results) -> list[str]:
     """Our figures in the columns of the paper; a dash where there is none."""
     if not row.scale:
         networks = [each for each in results.get("pose", []) if each["method"] == "networks"]
-        pairs = [(each[f"{key}_mean"], each[f"{key}_std"]) for each in networks for key in ("ate", "re")]
+        pairs = [
+            (each[f"{key}_mean"], each[f"{key}_std"]) for each in networks for key in ("ate", "re")
+        ]
         figures = [f"{mean:.4f} ± {deviation:.4f}" for mean, deviation in pairs]
     else:
         scaling = {"GT": "gt-median", "PoseNet": "pose"}[row.scale]
@@ -141,8 +152,15 @@ def tables(rows: Sequence[Row], results: dict[str, Results]) -> str:
         for row in rows:
             if bool(row.scale) == of_depth:
                 start = [f"`{row.training}`", row.scale or "each snippet's"]
-                lines += [[*start, "paper", *row.figures], [*start, "ours", *ours(row, results.get(row.training, {}))]]
-        parts += [Table(["training", "scale", "by", *head.split(" | ")], lines, names=3).markdown()] if lines else []
+                lines += [
+                    [*start, "paper", *row.figures],
+                    [*start, "ours", *ours(row, results.get(row.training, {}))],
+                ]
+        parts += (
+            [Table(["training", "scale", "by", *head.split(" | ")], lines, names=3).markdown()]
+            if lines
+            else []
+        )
     return "\n\n".join(parts) + "\n"
 
 
@@ -153,14 +171,19 @@ def _say_how_long(trainings: Sequence[Training], device: str) -> None:
             seconds = training.seconds_a_step(device)
             total += seconds * steps
             print(f"{training.name}: {steps} steps of {seconds:.3g} s", file=sys.stderr)
-    print(f"all trainings: {duration(total)}, and what shrinking frames and evaluating takes", file=sys.stderr)
+    print(
+        f"all trainings: {duration(total)}, and what shrinking frames and evaluating takes",
+        file=sys.stderr,
+    )
 
 
 def _require_tested(kitti: Path, raw: Path | None, split: str) -> None:
     """Refuse data without what is evaluated at the end, days later."""
     for name in TESTED:
         if any(part.true_poses("paper") is None for part in named_recordings(kitti, name)):
-            raise TrainingError(f"no true poses of sequence {name}: wanted {kitti}/poses/{name}.txt")
+            raise TrainingError(
+                f"no true poses of sequence {name}: wanted {kitti}/poses/{name}.txt"
+            )
     for frame in read_split(split, raw) if raw is not None else ():
         frame.image_path()
 
@@ -170,13 +193,46 @@ def main(words: Sequence[str] | None = None) -> None:
     """Train what is missing, evaluate, write the tables after every training."""
     parser = parser_of(__doc__)
     add = parser.add_argument
-    add("--kitti", type=Path, required=True, metavar="ROOT", help="KITTI odometry, colour, with poses")
-    add("--raw", type=Path, metavar="ROOT", help="KITTI raw: the folder of the dates, with LiDAR, for depth")
-    add("--rows", nargs="+", default=["*"], metavar="TRAINING", help="of the tables, * for any letters; all without it")
-    add("--output", type=Path, default=Path("runs/paper"), help="keeps shrunk frames and trainings; gets tables.md")
+    add(
+        "--kitti",
+        type=Path,
+        required=True,
+        metavar="ROOT",
+        help="KITTI odometry, colour, with poses",
+    )
+    add(
+        "--raw",
+        type=Path,
+        metavar="ROOT",
+        help="KITTI raw: the folder of the dates, with LiDAR, for depth",
+    )
+    add(
+        "--rows",
+        nargs="+",
+        default=["*"],
+        metavar="TRAINING",
+        help="of the tables, * for any letters; all without it",
+    )
+    add(
+        "--output",
+        type=Path,
+        default=Path("runs/paper"),
+        help="keeps shrunk frames and trainings; gets tables.md",
+    )
     add("--split", default="eigen", help="frames of --raw to test on, in place of the paper's")
-    add("--set", nargs="+", default=[], metavar="KEY=VALUE", help="changes to every training: not the paper's any more")
-    add("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where the networks compute")
+    add(
+        "--set",
+        nargs="+",
+        default=[],
+        metavar="KEY=VALUE",
+        help="changes to every training: not the paper's any more",
+    )
+    add(
+        "--device",
+        choices=("auto", "cpu", "cuda"),
+        default="auto",
+        help="where the networks compute",
+    )
     options = parser.parse_args(words)
     workers = min(max((os.cpu_count() or 2) - 1, 1), 8)
     changes = [f"data.workers={workers}", f"data.cache_mb={8000 // workers}", *options.set]
@@ -190,7 +246,9 @@ def main(words: Sequence[str] | None = None) -> None:
         for training in trainings:
             if training.steps_left() > 0:
                 training.run(options.device, progress)
-            results[training.name] = training.evaluate(options.kitti, options.raw, options.split, options.device)
+            results[training.name] = training.evaluate(
+                options.kitti, options.raw, options.split, options.device
+            )
             text = tables(rows, results)
             write_atomically(options.output / "tables.md", text)
     print(text)

@@ -34,7 +34,13 @@ Settings of `erfsfm train`. `configs/erfsfm/` holds complete experiments; `--con
 
 """
 # types, formats and bounds of a JSON schema
-WORDS = {"string": "text", "integer": "integer", "number": "number", "boolean": "true or false", "path": "path"}
+WORDS = {
+    "string": "text",
+    "integer": "integer",
+    "number": "number",
+    "boolean": "true or false",
+    "path": "path",
+}
 WORDS |= {"null": "null"}
 BOUNDS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
 HEADER = "| setting | values | default | meaning |\n|---|---|---|---|\n"
@@ -43,7 +49,9 @@ HEADER = "| setting | values | default | meaning |\n|---|---|---|---|\n"
 def main() -> None:
     """Write the page."""
     parser = parser_of(__doc__)
-    parser.add_argument("--output", type=Path, default=Path("docs/settings.md"), help="the page to write")
+    parser.add_argument(
+        "--output", type=Path, default=Path("docs/settings.md"), help="the page to write"
+    )
     output: Path = parser.parse_args().output
     write_atomically(output, page())
 
@@ -72,12 +80,21 @@ def summary(section: BaseModel) -> str:
 
 def table(section: BaseModel, prefix: str, keys: list[str]) -> str:
     """A line for each of these settings of a section, by its JSON schema."""
-    schema, defaults = type(section).model_json_schema()["properties"], section.model_dump(mode="json")
+    schema, defaults = (
+        type(section).model_json_schema()["properties"],
+        section.model_dump(mode="json"),
+    )
     text = HEADER
     for key in keys:
-        default = yaml.safe_dump(defaults[key], default_flow_style=True, width=10_000).removesuffix("...\n").strip()
+        default = (
+            yaml.safe_dump(defaults[key], default_flow_style=True, width=10_000)
+            .removesuffix("...\n")
+            .strip()
+        )
         limited = schema[key].get("anyOf", [schema[key]])[0]  # of an optional number
-        values = ", ".join([kind(schema[key]), *(f"{BOUNDS[b]} {limited[b]}" for b in BOUNDS if b in limited)])
+        values = ", ".join(
+            [kind(schema[key]), *(f"{BOUNDS[b]} {limited[b]}" for b in BOUNDS if b in limited)]
+        )
         text += f"| `{prefix}{key}` | {values} | `{default}` | {schema[key]['description']} |\n"
     return text
 

@@ -47,13 +47,25 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("run", type=Path, help="output folder of erfsfm train")
     parser.add_argument("name", help="name of the shipped weights")
-    parser.add_argument("--mean-with", action="append", default=[], help="weights to average with the run's; repeat")
+    parser.add_argument(
+        "--mean-with", action="append", default=[], help="weights to average with the run's; repeat"
+    )
     parser.add_argument("--data", required=True, help="one line: what it was trained on")
-    parser.add_argument("--held-out", default="simulated seeds 500-599", help="one line: what it never saw")
-    parser.add_argument("--command", help="in place of the recorded one, without the paths of one machine")
-    parser.add_argument("--note", required=True, help="a paragraph for the card: what taught each network, and how")
+    parser.add_argument(
+        "--held-out", default="simulated seeds 500-599", help="one line: what it never saw"
+    )
+    parser.add_argument(
+        "--command", help="in place of the recorded one, without the paths of one machine"
+    )
+    parser.add_argument(
+        "--note", required=True, help="a paragraph for the card: what taught each network, and how"
+    )
     parser.add_argument("--metrics", type=Path, help="output of erfsfm evaluate ... --json")
-    parser.add_argument("--evaluation", default="validation of the training run", help="the command behind --metrics")
+    parser.add_argument(
+        "--evaluation",
+        default="validation of the training run",
+        help="the command behind --metrics",
+    )
     arguments = parser.parse_args()
 
     model = averaged([load_model(each) for each in (arguments.run, *arguments.mean_with)])

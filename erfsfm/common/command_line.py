@@ -28,7 +28,9 @@ class Terminal(logging.StreamHandler[TextIO]):
         super().__init__(sys.stderr)
         self.setLevel(level)
         self._said: set[str] = set()
-        logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[self])
+        logging.basicConfig(
+            level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[self]
+        )
 
     def emit(self, record: logging.LogRecord) -> None:
         """Say a record, unless it is a warning and one like it was said."""
@@ -39,7 +41,9 @@ class Terminal(logging.StreamHandler[TextIO]):
 
 def application(name: str, about: str) -> typer.Typer:
     """A program of several verbs: plain help, since markup would lose what stands in brackets, and ``--version``."""
-    app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False, help=about)
+    app = typer.Typer(
+        no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False, help=about
+    )
 
     def print_version(wanted: bool) -> None:
         if wanted:
@@ -49,7 +53,11 @@ def application(name: str, about: str) -> typer.Typer:
     @app.callback()
     def of_all_verbs(
         version: bool = typer.Option(
-            False, "--version", callback=print_version, is_eager=True, help="print the version and exit"
+            False,
+            "--version",
+            callback=print_version,
+            is_eager=True,
+            help="print the version and exit",
         ),
     ) -> None:
         pass
@@ -71,7 +79,9 @@ def run(app: Callable[..., object], name: str, level: int) -> None:
         app(args=sys.argv[1:], prog_name=name)
     except SystemExit as end:
         if end.code == _INTERRUPTED or isinstance(end, Terminated):
-            _say(f"{name}: {end if isinstance(end, Terminated) else 'interrupted'}; what was written stays")
+            _say(
+                f"{name}: {end if isinstance(end, Terminated) else 'interrupted'}; what was written stays"
+            )
         raise
     except Exception as error:  # the last place where an error can become one line
         if shows_traceback():

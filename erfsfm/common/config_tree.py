@@ -24,7 +24,10 @@ class Section(BaseModel):
 
 
 def load_config(
-    model: type[M], file_or_name: str | Path | None, overrides: Sequence[str], shipped: Sequence[Path]
+    model: type[M],
+    file_or_name: str | Path | None,
+    overrides: Sequence[str],
+    shipped: Sequence[Path],
 ) -> M:
     """Read a YAML file, or one of the ``shipped`` folders by its name; None for the defaults of the ``model``.
 
@@ -37,7 +40,9 @@ def load_config(
         path = find_config(file_or_name, shipped)
         origin, tree = str(path), read_yaml(path) or {}
         if not isinstance(tree, dict):
-            raise ConfigError(f"{path} must hold sections of keys; got {type(tree).__name__} {_shown(tree)}")
+            raise ConfigError(
+                f"{path} must hold sections of keys; got {type(tree).__name__} {_shown(tree)}"
+            )
     for text in overrides:
         _override(tree, text)
     try:
@@ -51,16 +56,24 @@ def find_config(file_or_name: str | Path, shipped: Sequence[Path]) -> Path:
     path = Path(file_or_name)
     if path.is_file():
         return path
-    known = {file.stem: file for folder in reversed(shipped) for file in sorted(folder.glob("*.yaml"))}
+    known = {
+        file.stem: file for folder in reversed(shipped) for file in sorted(folder.glob("*.yaml"))
+    }
     if str(file_or_name) in known:
         return known[str(file_or_name)]
     if path.is_dir():
         raise ConfigError(f"configuration '{file_or_name}' is a folder, not a YAML file")
     nearest = difflib.get_close_matches(path.stem, known, 1)
     hint = f"; did you mean '{nearest[0]}'?" if nearest else ""
-    begun = [name for name in sorted(known) if name.startswith(path.stem)]  # "table1" is the beginning of many
-    names = ", ".join(begun or (name for name in sorted(known) if "-" not in name))  # variants have a dash
-    raise ConfigError(f"no configuration file or name '{file_or_name}' (known names: {names or 'none'}){hint}")
+    begun = [
+        name for name in sorted(known) if name.startswith(path.stem)
+    ]  # "table1" is the beginning of many
+    names = ", ".join(
+        begun or (name for name in sorted(known) if "-" not in name)
+    )  # variants have a dash
+    raise ConfigError(
+        f"no configuration file or name '{file_or_name}' (known names: {names or 'none'}){hint}"
+    )
 
 
 def read_model(model: type[M], path: Path, error: type[ErfsfmError], wrong: str) -> M:
@@ -86,7 +99,11 @@ def dump_explained(config: BaseModel) -> str:
         summary = (type(section).__doc__ or "").partition("\n")[0].rstrip(".").replace("``", "")
         lines += [*([""] if lines else []), f"{name}:  # {summary}"]
         for key, value in section.model_dump(mode="json").items():
-            text = yaml.safe_dump(value, default_flow_style=True, width=10_000).removesuffix("...\n").strip()
+            text = (
+                yaml.safe_dump(value, default_flow_style=True, width=10_000)
+                .removesuffix("...\n")
+                .strip()
+            )
             lines.append(f"  {key}: {text}  # {type(section).model_fields[key].description}")
     return "\n".join(lines) + "\n"
 
@@ -117,7 +134,9 @@ def _override(tree: dict[str, Any], text: str) -> None:
     tree[parts[-1]] = value
 
 
-def _one_line(error: ValidationError, model: type[BaseModel], origin: str, overrides: Sequence[str]) -> str:
+def _one_line(
+    error: ValidationError, model: type[BaseModel], origin: str, overrides: Sequence[str]
+) -> str:
     first = error.errors(include_url=False)[0]
     known = list(_known_keys(model))
     place = ".".join(str(part) for part in first["loc"])
@@ -127,8 +146,16 @@ def _one_line(error: ValidationError, model: type[BaseModel], origin: str, overr
     # pydantic appends the branch of a union, or the place inside a value
     key = max((name for name in known if f"{place}.".startswith(f"{name}.")), key=len, default="")
     is_section = first["type"] == "model_type"
-    wanted = "a section" if is_section else first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
-    return f"'{key}' in {origin} should be {wanted}; got {_shown(first['input'])}" if key else f"{origin}: {wanted}"
+    wanted = (
+        "a section"
+        if is_section
+        else first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    )
+    return (
+        f"'{key}' in {origin} should be {wanted}; got {_shown(first['input'])}"
+        if key
+        else f"{origin}: {wanted}"
+    )
 
 
 def _origin(place: str, origin: str, overrides: Sequence[str]) -> str:
@@ -143,7 +170,9 @@ def _origin(place: str, origin: str, overrides: Sequence[str]) -> str:
 def _nearest_key(key: str, known: Sequence[str]) -> str:
     section, _, last = key.rpartition(".")
     siblings = [name for name in known if name.rpartition(".")[0] == section]
-    last_words = {name.rpartition(".")[2]: name for name in (*reversed(known), *siblings)}  # siblings first
+    last_words = {
+        name.rpartition(".")[2]: name for name in (*reversed(known), *siblings)
+    }  # siblings first
     if nearest := difflib.get_close_matches(last, last_words, 1, 0.7):
         return f"did you mean '{last_words[nearest[0]]}'?"
     return f"known keys{f' of {section}' if section else ''}: {', '.join(siblings)}"
@@ -187,9 +216,16 @@ def parse_yaml(text: str) -> Any:
     try:
         return yaml.load(text, Loader=_Loader)
     except yaml.YAMLError as error:
-        problem, mark = getattr(error, "problem", None) or str(error), getattr(error, "problem_mark", None)
+        problem, mark = (
+            getattr(error, "problem", None) or str(error),
+            getattr(error, "problem_mark", None),
+        )
         raise YamlError(f"{problem} (line {mark.line + 1})" if mark else problem) from error
-    except (ValueError, TypeError, RecursionError) as error:  # no date, a list for a key, endless lists
+    except (
+        ValueError,
+        TypeError,
+        RecursionError,
+    ) as error:  # no date, a list for a key, endless lists
         raise YamlError(str(error)) from error
 
 
@@ -201,11 +237,15 @@ class _Loader(yaml.SafeLoader):
         keys = [key.value for key, _ in node.value]
         for key in keys:
             if keys.count(key) > 1:
-                raise yaml.MarkedYAMLError(problem=f"duplicate key '{key}'", problem_mark=node.start_mark)
+                raise yaml.MarkedYAMLError(
+                    problem=f"duplicate key '{key}'", problem_mark=node.start_mark
+                )
         return super().construct_mapping(node, deep)
 
 
 # PyYAML follows YAML 1.1, where a float needs a dot
 _Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"),
+    list("-+.0123456789"),
 )

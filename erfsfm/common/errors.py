@@ -10,9 +10,16 @@ _OF_WORKER = "Original Traceback (most recent call last)"
 SHOW_TRACEBACK = "ERFSFM_TRACEBACK"
 
 OUT_OF_MEMORY = (
-    "memory ran out; what was written stays: use fewer frames or smaller images, or a machine with more memory"
+    "memory ran out; what was written stays: "
+    "use fewer frames or smaller images, or a machine with more memory"
 )
-_MEMORY = ("not enough memory", "cannot allocate memory", "bad_alloc", "bad alloc", "can't start new thread")
+_MEMORY = (
+    "not enough memory",
+    "cannot allocate memory",
+    "bad_alloc",
+    "bad alloc",
+    "can't start new thread",
+)
 
 
 def one_line(text: str) -> str:

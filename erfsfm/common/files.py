@@ -29,7 +29,9 @@ _FIGURE_METADATA: dict[str, dict[str, str | None]] = {
 FIGURE_SUFFIXES = tuple(_FIGURE_METADATA)
 
 
-def write_atomically(path: Path, content: str | bytes | Callable[[Path], object], sync: bool = True) -> None:
+def write_atomically(
+    path: Path, content: str | bytes | Callable[[Path], object], sync: bool = True
+) -> None:
     """Write ``content``, or let it write, a temporary file beside ``path``, then rename it; missing folders are made.
 
     The temporary name ends as ``path`` does, for writers that look at the suffix. With ``sync`` the disk holds the
@@ -104,7 +106,9 @@ def save_figure(figure: Figure, path: Path, dpi: int) -> None:
     require_figure(path)
     suffix = path.suffix.lower()
     metadata = _FIGURE_METADATA[suffix]
-    write_atomically(path, lambda part: figure.savefig(part, format=suffix[1:], dpi=dpi, metadata=metadata))
+    write_atomically(
+        path, lambda part: figure.savefig(part, format=suffix[1:], dpi=dpi, metadata=metadata)
+    )
 
 
 class FolderLock(ExitStack):
@@ -124,6 +128,8 @@ class FolderLock(ExitStack):
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX if waits else fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise BusyError(f"another process writes to {folder}: wait, or choose another --output") from error
+            raise BusyError(
+                f"another process writes to {folder}: wait, or choose another --output"
+            ) from error
         except OSError:  # no locks here
             return

@@ -38,7 +38,9 @@ def processes(work: str) -> Iterator[ProcessPoolExecutor]:
         try:
             yield pool
         except BrokenProcessPool as error:
-            raise TrainingError(f"a process that {work} was killed: is there enough memory?") from error
+            raise TrainingError(
+                f"a process that {work} was killed: is there enough memory?"
+            ) from error
         finally:
             pool.shutdown(cancel_futures=True)
 
@@ -63,7 +65,9 @@ def slam_process(
         program: module that is run, with words before the arguments.
         variables: of its environment, beside those of this process.
     """
-    limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), str(threads))
+    limits = dict.fromkeys(
+        ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), str(threads)
+    )
     with tempfile.TemporaryFile("w+b") if log is None else log.open("a+b") as said:
         process = subprocess.Popen(
             [sys.executable, "-Pm", *program, *arguments],
@@ -79,7 +83,11 @@ def slam_process(
             process.kill()
             process.wait()
         said.seek(max(said.seek(0, os.SEEK_END) - _MOST_SAID, 0))
-        lines = [line.strip() for line in said.read().decode(errors="replace").splitlines() if line.strip()]
+        lines = [
+            line.strip()
+            for line in said.read().decode(errors="replace").splitlines()
+            if line.strip()
+        ]
     code = process.returncode
     if exceeded or code == 0:
         return exceeded
@@ -96,8 +104,12 @@ def _watch(process: subprocess.Popen[bytes], memory_gib: float) -> str:
             return ""
         except subprocess.TimeoutExpired:
             used = 0.0
-            with suppress(OSError, IndexError, ValueError):  # it has ended, or the system tells nothing
-                pages = int(Path(f"/proc/{process.pid}/statm").read_text(encoding="ascii").split()[1])
+            with suppress(
+                OSError, IndexError, ValueError
+            ):  # it has ended, or the system tells nothing
+                pages = int(
+                    Path(f"/proc/{process.pid}/statm").read_text(encoding="ascii").split()[1]
+                )
                 used = pages * os.sysconf("SC_PAGE_SIZE") / _GIB
             if 0 < memory_gib < used:
                 return f"it used {used:.1f} GiB of memory, more than the {memory_gib:.1f} GiB of --memory"
@@ -134,7 +146,9 @@ def opencv_threads(count: int) -> Iterator[None]:
 
 def stay_single_threaded() -> None:
     """Start no threads in this process from here on, which is one of as many as there are cores."""
-    os.environ["OMP_NUM_THREADS"] = "1"  # read when other libraries are loaded, and by `usable_cores`
+    os.environ["OMP_NUM_THREADS"] = (
+        "1"  # read when other libraries are loaded, and by `usable_cores`
+    )
     cv2.setNumThreads(1)
     threadpool_limits(1)
 
@@ -154,11 +168,15 @@ def open_session(content: bytes, threads: int) -> InferenceSession:
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.log_severity_level = _FATAL
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # costly on a shared machine
+    options.add_session_config_entry(
+        "session.intra_op.allow_spinning", "0"
+    )  # costly on a shared machine
     return InferenceSession(content, options, providers=["CPUExecutionProvider"])
 
 
-def read_ahead(read: Callable[[int], T], numbers: Sequence[int], threads: int = 1) -> Generator[T, None, None]:
+def read_ahead(
+    read: Callable[[int], T], numbers: Sequence[int], threads: int = 1
+) -> Generator[T, None, None]:
     """The result of ``read`` for each number, computed in other ``threads`` while the one before is used.
 
     They end with the numbers, or when the generator is closed. With more than one, calls must be independent.

@@ -26,7 +26,12 @@ def progress_bar() -> Iterator[Progress]:
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
         from rich.progress import Progress as Bars
 
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+        )
         tasks: dict[str, Any] = {}
         with Bars(*columns, console=Console(stderr=True)) as bars:
 
@@ -68,7 +73,9 @@ def duration(seconds: float) -> str:
     minutes, hours = round(seconds) // 60, round(seconds) // 3600
     if hours >= 48:
         return f"{hours / 24:.1f} days"
-    return f"{hours} h {minutes % 60} min" if hours >= 2 else f"{minutes} min {round(seconds) % 60} s"
+    return (
+        f"{hours} h {minutes % 60} min" if hours >= 2 else f"{minutes} min {round(seconds) % 60} s"
+    )
 
 
 def _name(stage: str) -> str:

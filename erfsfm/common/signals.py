@@ -31,7 +31,10 @@ def calling_on_signals(stop: Callable[..., None]) -> Iterator[None]:
     before = _handlers(("SIGINT", *_NAMES), lambda handler: handler is not signal.SIG_IGN)
 
     def first(*_: object) -> None:
-        _handle(dict.fromkeys(before, signal.SIG_IGN) | {n: before[n] for n in before if n == signal.SIGINT})
+        _handle(
+            dict.fromkeys(before, signal.SIG_IGN)
+            | {n: before[n] for n in before if n == signal.SIGINT}
+        )
         stop()
 
     _handle(dict.fromkeys(before, first))
@@ -71,7 +74,11 @@ def _handlers(names: Sequence[str], is_replaced: Callable[[Any], bool]) -> dict[
     """Handlers that may be replaced, by signal; none outside the main thread."""
     if threading.current_thread() is not threading.main_thread():
         return {}
-    handlers = {number: signal.getsignal(number) for name in names if (number := getattr(signal, name, None))}
+    handlers = {
+        number: signal.getsignal(number)
+        for name in names
+        if (number := getattr(signal, name, None))
+    }
     return {number: handler for number, handler in handlers.items() if is_replaced(handler)}
 
 

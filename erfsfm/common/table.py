@@ -44,7 +44,9 @@ class Table:
         console = Console(width=None if on_terminal else _IN_A_PIPE)
         table = RichTable(pad_edge=False, box=SIMPLE_HEAD)
         for column, header in enumerate(self.head):
-            table.add_column(header, justify="left" if column < self.names else "right", overflow="fold")
+            table.add_column(
+                header, justify="left" if column < self.names else "right", overflow="fold"
+            )
         for row in self.rows:
             cells = [Text(text) for text in row]
             for cell in cells:
@@ -75,7 +77,14 @@ class Table:
 def table_of(rows: Sequence[dict[str, Any]]) -> Table:
     """Records as a table whose head are their keys."""
     keys = list(dict.fromkeys(key for row in rows for key in row))
-    names = next((k for k, key in enumerate(keys) if any(isinstance(row.get(key), float | int) for row in rows)), 1)
+    names = next(
+        (
+            k
+            for k, key in enumerate(keys)
+            if any(isinstance(row.get(key), float | int) for row in rows)
+        ),
+        1,
+    )
     return Table(keys, [[_written(row.get(key)) for key in keys] for row in rows], names=names)
 
 
@@ -95,5 +104,7 @@ def _written(value: Any) -> str:
 
 
 def _html_row(cells: Sequence[str], tag: str) -> str:
-    texts = (cell if hasattr(cell, "__html__") else escape(cell).replace("\n", "<br>") for cell in cells)
+    texts = (
+        cell if hasattr(cell, "__html__") else escape(cell).replace("\n", "<br>") for cell in cells
+    )
     return f"<tr>{''.join(f'<{tag}>{text}</{tag}>' for text in texts)}</tr>"

@@ -23,7 +23,12 @@ _BLUR_SAMPLES = 6  # images averaged into a blurred one
 
 
 def augment(
-    images: Images, maps: Maps, camera: Camera, config: DataConfig, fidelity: Fidelity, rng: np.random.Generator
+    images: Images,
+    maps: Maps,
+    camera: Camera,
+    config: DataConfig,
+    fidelity: Fidelity,
+    rng: np.random.Generator,
 ) -> tuple[Images, Maps, Camera, bool]:
     """Flip, scale-crop and recolour a snippet, all frames in the same way.
 
@@ -61,16 +66,30 @@ def rolled(
     cos, sin = np.cos(angle), np.sin(angle)
     move = (K @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ np.linalg.inv(K))[:2]
     size = (camera.width, camera.height)
-    turned = cv2.warpAffine(image, move, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    turned = cv2.warpAffine(
+        image, move, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+    )
     nearest = [
-        cv2.warpAffine(values, move, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=value)
+        cv2.warpAffine(
+            values,
+            move,
+            size,
+            flags=cv2.INTER_NEAREST,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=value,
+        )
         for values, value in zip(maps, unknown, strict=True)
     ]
     return np.asarray(turned, np.uint8), nearest
 
 
 def _scale_crop(
-    images: Images, maps: Maps, camera: Camera, zoom: float, fidelity: Fidelity, rng: np.random.Generator
+    images: Images,
+    maps: Maps,
+    camera: Camera,
+    zoom: float,
+    fidelity: Fidelity,
+    rng: np.random.Generator,
 ) -> tuple[Images, Maps, Camera]:
     """Enlarge each axis by its own factor and crop back at a random place."""
     width, height = camera.width, camera.height
@@ -80,8 +99,14 @@ def _scale_crop(
     left = int(rng.integers(size[0] - width + 1))
     top = int(rng.integers(size[1] - height + 1))
     part = slice(top, top + height), slice(left, left + width)
-    crops = [np.ascontiguousarray(cv2.resize(i, size, interpolation=cv2.INTER_LINEAR)[part]) for i in images]
-    moved = [np.ascontiguousarray(cv2.resize(m, size, interpolation=cv2.INTER_NEAREST_EXACT)[part]) for m in maps]
+    crops = [
+        np.ascontiguousarray(cv2.resize(i, size, interpolation=cv2.INTER_LINEAR)[part])
+        for i in images
+    ]
+    moved = [
+        np.ascontiguousarray(cv2.resize(m, size, interpolation=cv2.INTER_NEAREST_EXACT)[part])
+        for m in maps
+    ]
     return crops, moved, enlarged.cropped(left, top, width, height)
 
 
@@ -94,9 +119,13 @@ def _recolour(images: Images, strength: float, rng: np.random.Generator) -> Imag
     grey = rng.random() < 0.3
     values = np.arange(256) / 255
     curve = (np.power(values, gamma) - 0.45) * contrast + 0.45
-    table = np.clip(np.rint(curve[:, None] * gain * tint * 255), 0, 255).astype(np.uint8)[None]  # (1, 256, 3)
+    table = np.clip(np.rint(curve[:, None] * gain * tint * 255), 0, 255).astype(np.uint8)[
+        None
+    ]  # (1, 256, 3)
     if grey:
-        images = [cv2.cvtColor(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB) for i in images]
+        images = [
+            cv2.cvtColor(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB) for i in images
+        ]
         table = np.repeat(table[..., :1], 3, axis=-1)
     return [cv2.LUT(image, table) for image in images]
 
@@ -127,15 +156,24 @@ def _shadowed(image: NDArray[np.float32], rng: np.random.Generator) -> NDArray[n
         for _ in range(int(rng.integers(1, 4))):
             ends = rng.uniform(0.35, 1.1, 2) * height
             thickness = rng.uniform(0.02, 0.3, 2) * height
-            corners = [(0, ends[0]), (width, ends[1]), (width, ends[1] + thickness[1]), (0, ends[0] + thickness[0])]
+            corners = [
+                (0, ends[0]),
+                (width, ends[1]),
+                (width, ends[1] + thickness[1]),
+                (0, ends[0] + thickness[0]),
+            ]
             cv2.fillConvexPoly(shade, np.rint(corners).astype(np.int32), 1.0)
     else:
         cells = (max(2, int(rng.integers(6, 24))), max(2, int(rng.integers(8, 32))))
-        spots = cv2.resize(rng.random(cells).astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
+        spots = cv2.resize(
+            rng.random(cells).astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC
+        )
         shade[spots < rng.uniform(0.3, 0.6)] = 1
         shade[: int(rng.uniform(0.35, 0.6) * height)] = 0
     shade = cv2.GaussianBlur(shade, (0, 0), float(rng.uniform(0.5, 2.5)))[..., None]
-    dark = rng.uniform(0.15, 0.6) * np.array([1, 1, rng.uniform(1, 1.2)])  # the sky's light is bluer than the sun's
+    dark = rng.uniform(0.15, 0.6) * np.array(
+        [1, 1, rng.uniform(1, 1.2)]
+    )  # the sky's light is bluer than the sun's
     return np.asarray(image * (1 - shade * (1 - dark.astype(np.float32))), np.float32)
 
 
@@ -153,7 +191,10 @@ def _blurred(images: Pictures, rng: np.random.Generator) -> Pictures:
         moves.append(np.array([[zoom, 0, shift[0]], [0, zoom, shift[1]]]))
     border = cv2.BORDER_REPLICATE
     blurred = [
-        np.mean([cv2.warpAffine(image, move, (width, height), borderMode=border) for move in moves], axis=0)
+        np.mean(
+            [cv2.warpAffine(image, move, (width, height), borderMode=border) for move in moves],
+            axis=0,
+        )
         for image in images
     ]
     return [np.asarray(image, dtype=np.float32) for image in blurred]
@@ -164,7 +205,10 @@ def _exposed(images: Pictures, rng: np.random.Generator) -> Pictures:
     jump = int(rng.integers(len(images) + 1))
     before, after = ((float(rng.uniform(0.5, 1.6)), float(rng.uniform(0.7, 1.4))) for _ in range(2))
     chosen = [before if k < jump else after for k in range(len(images))]
-    return [np.float32(gain) * np.power(image, np.float32(gamma)) for image, (gain, gamma) in zip(images, chosen)]
+    return [
+        np.float32(gain) * np.power(image, np.float32(gamma))
+        for image, (gain, gamma) in zip(images, chosen)
+    ]
 
 
 def _rained_on(images: Pictures, rng: np.random.Generator) -> Pictures:
@@ -176,7 +220,9 @@ def _rained_on(images: Pictures, rng: np.random.Generator) -> Pictures:
     slant = float(rng.uniform(-0.4, 0.4))
     streak = np.zeros((length, length), np.float32)
     rows = np.arange(length)
-    streak[rows, np.clip(np.rint(length / 2 + slant * (rows - length / 2)), 0, length - 1).astype(int)] = 1
+    streak[
+        rows, np.clip(np.rint(length / 2 + slant * (rows - length / 2)), 0, length - 1).astype(int)
+    ] = 1
     wet = []
     for image in images:
         drops = (rng.random((height, width)) < density).astype(np.float32)
@@ -213,10 +259,15 @@ def training_sample(
         ``shown`` (N + 1, 3, H, W): the images in time order as the networks see them.
     """
     bounds = [] if seen is None else [seen.least.astype(np.float32), seen.most.astype(np.float32)]
-    images, bounds, varied, mirrored = augment(images, bounds, camera, config.data, config.network.fidelity, rng)
+    images, bounds, varied, mirrored = augment(
+        images, bounds, camera, config.data, config.network.fidelity, rng
+    )
     sample = as_tensors(images, varied.K)
     if seen is not None:
-        mirror, nearer = np.diag([-1 if mirrored else 1, 1, 1, 1]).astype(np.float32), _nearer(varied, config)
+        mirror, nearer = (
+            np.diag([-1 if mirrored else 1, 1, 1, 1]).astype(np.float32),
+            _nearer(varied, config),
+        )
         T_source_target = mirror @ seen.T_source_target @ mirror
         T_source_target[:, :3, 3] /= nearer
         sample["T_source_target"] = torch.from_numpy(T_source_target)
@@ -245,12 +296,16 @@ def single_image(
     if config.data.roll > 0:
         angle = np.deg2rad(rng.uniform(-config.data.roll, config.data.roll))
         image, maps = rolled(image, maps, camera, angle, (0, np.inf))
-    images, maps, varied, _ = augment([image], maps, camera, config.data, config.network.fidelity, rng)
+    images, maps, varied, _ = augment(
+        [image], maps, camera, config.data, config.network.fidelity, rng
+    )
     sample = {"target": _stacked(images)[0], "K": torch.from_numpy(varied.K)}
     return sample | _bounds(maps, _nearer(varied, config))
 
 
-def in_heights(inverse_depth: NDArray[np.float32], camera: Camera, config: ExperimentConfig) -> NDArray[np.float32]:
+def in_heights(
+    inverse_depth: NDArray[np.float32], camera: Camera, config: ExperimentConfig
+) -> NDArray[np.float32]:
     """Inverse depth ``(H, W)`` that a network gives for an image, in camera heights."""
     return inverse_depth / np.float32(HEIGHTS * _nearer(camera, config))
 

@@ -14,7 +14,13 @@ from typing import TypeVar
 
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import CAMERA_FILE, read_camera_file
-from erfsfm.common.readers.images import first_size, has_images, image_folder, list_images, recording_folder
+from erfsfm.common.readers.images import (
+    first_size,
+    has_images,
+    image_folder,
+    list_images,
+    recording_folder,
+)
 from erfsfm.common.readers.kitti import (
     CAM_TO_CAM,
     ODOMETRY_CALIBRATION,
@@ -32,7 +38,9 @@ from erfsfm.data.prepared import INDEX_FILE, read_prepared
 from erfsfm.data.recordings import Recording, Video, split_at_gaps
 from erfsfm.geometry import Camera
 
-INDOOR_HEIGHT_M = 0.4  # for rooms, whose depths in this unit are those of streets in camera heights: from 1 to 20
+INDOOR_HEIGHT_M = (
+    0.4  # for rooms, whose depths in this unit are those of streets in camera heights: from 1 to 20
+)
 _COLOUR = (2, 3)
 logger = logging.getLogger(__name__)
 Number = TypeVar("Number", int, str)
@@ -52,7 +60,9 @@ def discover(root: Path) -> list[Recording]:
         children = sorted(p for p in visible if p.is_dir() or p.suffix.lower() in VIDEO_SUFFIXES)
         found = [r for child in children for r in _recordings_at(child)]
     if not found:
-        entries = ", ".join(sorted(p.name for p in root.iterdir())[:8]) if root.is_dir() else root.name
+        entries = (
+            ", ".join(sorted(p.name for p in root.iterdir())[:8]) if root.is_dir() else root.name
+        )
         raise DataError(
             f"no recording in {root}: wanted a KITTI odometry root (sequences/NN/image_2), KITTI raw drives "
             f"(2011_09_26/..._sync/image_02), images or a video with camera.yaml, or a prepared folder "
@@ -78,7 +88,9 @@ def _odometry(root: OdometryRoot, sequence: Path) -> list[Recording]:
     """The cameras of a sequence in parts without gaps."""
     folders = {c: folder for c in ODOMETRY_CAMERAS if (folder := sequence / f"image_{c}").is_dir()}
     poses, written = root.base / "poses" / f"{sequence.name}.txt", root.base / CAMERA_FILE
-    height_m: float | None = None  # of the camera in a simulated world, in rooms a constant; unknown in a real root
+    height_m: float | None = (
+        None  # of the camera in a simulated world, in rooms a constant; unknown in a real root
+    )
     if root.simulation_seed() is not None and written.is_file():
         height_m = read_camera_file(written).height_or(None) or INDOOR_HEIGHT_M
     recordings = []
@@ -91,7 +103,9 @@ def _odometry(root: OdometryRoot, sequence: Path) -> list[Recording]:
             root.recording_name(sequence.name),
             files.paths,
             Camera.of(pinhole),
-            depth=depth if camera == ODOMETRY_CAMERAS[0] and all(path.is_file() for path in depth) else None,
+            depth=depth
+            if camera == ODOMETRY_CAMERAS[0] and all(path.is_file() for path in depth)
+            else None,
             poses_file=poses if poses.is_file() else None,
             camera_height_m=height_m,
             t_camera_cam0=(tx, ty, tz),
@@ -105,7 +119,9 @@ def open_drive(drive: Path) -> list[Recording]:
     """The cameras of a raw drive in parts without gaps; none where it has no images."""
     drive = drive.absolute()
     oxts = drive / "oxts" / "data"
-    folders = {c: folder for c in RAW_CAMERAS if has_images(folder := drive / f"image_{c}" / "data")}
+    folders = {
+        c: folder for c in RAW_CAMERAS if has_images(folder := drive / f"image_{c}" / "data")
+    }
     recordings = []
     for camera, files, (height, width) in _cameras(folders):
         calibration = CalibrationFile(drive.parent / CAM_TO_CAM)
@@ -119,13 +135,17 @@ def open_drive(drive: Path) -> list[Recording]:
     return recordings
 
 
-def _cameras(folders: dict[Number, Path]) -> Iterator[tuple[Number, NumberedFiles, tuple[int, int]]]:
+def _cameras(
+    folders: dict[Number, Path],
+) -> Iterator[tuple[Number, NumberedFiles, tuple[int, int]]]:
     """Images of the colour cameras, else of the first of the grey ones, with their height and width."""
     colour = [camera for camera in folders if int(camera) in _COLOUR]
     for camera in colour or list(folders)[:1]:
         images = list_images(folders[camera])
         if not images:
-            raise DataError(f"{folders[camera]} holds no png or jpg; download or extract the images")
+            raise DataError(
+                f"{folders[camera]} holds no png or jpg; download or extract the images"
+            )
         files = by_number(images)
         yield camera, files, first_size(files.paths)
 
@@ -138,16 +158,24 @@ def _own(root: Path) -> list[Recording]:
         return []
     written = read_camera_file(home / CAMERA_FILE)
     if written.is_distorted:
-        raise DataError(f"{home / CAMERA_FILE} describes a distorted camera: undistort the images before training")
+        raise DataError(
+            f"{home / CAMERA_FILE} describes a distorted camera: undistort the images before training"
+        )
     camera = Camera.of(written.pinhole)
     images: list[Path] = []
     if not is_video:  # those of a folder, or those of its one sub-folder of a usual name, or of the first that has any
         usual = image_folder(home)
-        folders = [usual] if usual is not None else sorted(path for path in home.iterdir() if path.is_dir())
+        folders = (
+            [usual]
+            if usual is not None
+            else sorted(path for path in home.iterdir() if path.is_dir())
+        )
         images = next((found for folder in folders if (found := list_images(folder))), [])
     if not images:
         videos = [Video(file) for file in ([root] if is_video else list_videos(home))]
-        return [Recording(f"folder/{video_name(v.path)}", (v.path,) * len(v), camera, v) for v in videos]
+        return [
+            Recording(f"folder/{video_name(v.path)}", (v.path,) * len(v), camera, v) for v in videos
+        ]
     files = by_name(images)
     recording = recording_folder(home)
     whole, maps = Recording(f"folder/{recording.name}", files.paths, camera), recording / "depth"
@@ -155,9 +183,15 @@ def _own(root: Path) -> list[Recording]:
     missing = [path.name for path in depth if not path.is_file()]
     if depth and not missing:  # as a depth camera measures it
         if written.depth_per_metre is None:
-            raise DataError(f"{home / CAMERA_FILE}: add depth_per_metre, the value of one metre in {maps}: 1000 in mm")
+            raise DataError(
+                f"{home / CAMERA_FILE}: add depth_per_metre, the value of one metre in {maps}: 1000 in mm"
+            )
         height_m = written.height_or(None) or INDOOR_HEIGHT_M
-        whole = replace(whole, depth=depth, depth_per_metre=written.depth_per_metre, camera_height_m=height_m)
+        whole = replace(
+            whole, depth=depth, depth_per_metre=written.depth_per_metre, camera_height_m=height_m
+        )
     elif len(missing) < len(depth):
-        logger.warning("%s is not used: it has no %s; move the images without depth away", maps, missing[0])
+        logger.warning(
+            "%s is not used: it has no %s; move the images without depth away", maps, missing[0]
+        )
     return split_at_gaps(whole, files)

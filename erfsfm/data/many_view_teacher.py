@@ -47,7 +47,9 @@ _CHUNK = 8  # labels of one task
 _DIGITS = 32  # of a digest
 
 Bounds = tuple[NDArray[np.float32], NDArray[np.float32]]  # least and most inverse depth (H, W)
-Learned = Callable[[NDArray[np.uint8]], NDArray[np.float32]]  # inverse depth (H, W) in any unit, of an RGB image
+Learned = Callable[
+    [NDArray[np.uint8]], NDArray[np.float32]
+]  # inverse depth (H, W) in any unit, of an RGB image
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,9 @@ class DriveLabels:
     def targets(self, sources: int) -> range:
         """Frames with a label that have half of ``sources`` on either side, counted from the recording's first."""
         half = sources // 2
-        return range(half + -(self.skipped + half) % self.stride, len(self.recording) - half, self.stride)
+        return range(
+            half + -(self.skipped + half) % self.stride, len(self.recording) - half, self.stride
+        )
 
     @cached_property
     def T_world_camera(self) -> NDArray[np.float64]:
@@ -100,7 +104,9 @@ class DriveLabels:
             with np.load(path, allow_pickle=False) as entry:
                 return entry["least"], entry["most"]
         except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise TrainingError(f"the teacher's label {path} is damaged: delete it, start again ({error})") from error
+            raise TrainingError(
+                f"the teacher's label {path} is damaged: delete it, start again ({error})"
+            ) from error
 
     def measure_poses(self, weights: str) -> None:
         """Run the SLAM system on the drive and keep its poses; ``TrainingError`` without a trajectory or a scale."""
@@ -114,17 +120,36 @@ class DriveLabels:
             else:  # in order and at full size, which `Video` is not made for
                 frames = VideoFrames(recording.video.path, counted_frames=0)
                 for index in range(len(recording)):
-                    cv2.imwrite(str(drive / f"{index:06d}.png"), frames.read(recording.start + index)[..., ::-1])
+                    cv2.imwrite(
+                        str(drive / f"{index:06d}.png"),
+                        frames.read(recording.start + index)[..., ::-1],
+                    )
             camera = asdict(recording.camera) | {"fps": _FPS, "camera_height_m": _CAMERA_HEIGHT_M}
             (drive / "camera.yaml").write_text(yaml.safe_dump(camera))
-            words = ["run", "--dataset", str(drive), "--output", str(output), "--weights", weights, "--device", "cpu"]
-            reason = slam_process([*words, *(word for setting in _SETTINGS for word in ("--set", setting))])
+            words = [
+                "run",
+                "--dataset",
+                str(drive),
+                "--output",
+                str(output),
+                "--weights",
+                weights,
+                "--device",
+                "cpu",
+            ]
+            reason = slam_process(
+                [*words, *(word for setting in _SETTINGS for word in ("--set", setting))]
+            )
             if reason or not (output / _TRAJECTORY).is_file():
-                raise TrainingError(f"the teacher's poses of {name} could not be found: {reason or 'it wrote none'}")
+                raise TrainingError(
+                    f"the teacher's poses of {name} could not be found: {reason or 'it wrote none'}"
+                )
             rows = np.loadtxt(output / _TRAJECTORY).reshape(-1, 3, 4)
             mode = json.loads((output / "metrics.json").read_text())["scale"]["mode"]
         if mode != "camera-height":
-            raise TrainingError(f"the teacher's poses of {name} have no scale: no road was found (scale mode {mode})")
+            raise TrainingError(
+                f"the teacher's poses of {name} have no scale: no road was found (scale mode {mode})"
+            )
         T_world_camera = np.tile(np.eye(4), (len(rows), 1, 1))
         T_world_camera[:, :3] = rows
         T_world_camera[:, :3, 3] /= _CAMERA_HEIGHT_M
@@ -157,11 +182,15 @@ class DriveLabels:
             if bounds is None:
                 bounds = np.zeros(self.size, np.float32), np.full(self.size, np.inf, np.float32)
             least, most = (
-                cv2.resize(values, self.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float16)
+                cv2.resize(values, self.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(
+                    np.float16
+                )
                 for values in bounds
             )
             arrays = {"least": least, "most": most}
-            write_atomically(self.label_file(target), partial(np.savez_compressed, **arrays), sync=False)
+            write_atomically(
+                self.label_file(target), partial(np.savez_compressed, **arrays), sync=False
+            )
         return len(targets)
 
     def _bounds(self, target: int, learned: Learned | None) -> Bounds | None:
@@ -180,16 +209,25 @@ class DriveLabels:
         grey, K, motion = _grey(image), camera.K.astype(np.float64), self._motion(target, around)
         if learned is None:
             return label(grey, [*around.values()], K, motion)
-        inverse_depth = in_camera_heights(learned(image), *measure(grey, [*around.values()], K, motion))
+        inverse_depth = in_camera_heights(
+            learned(image), *measure(grey, [*around.values()], K, motion)
+        )
         if inverse_depth is None:
             return None
         frames = np.arange(len(self.recording))
-        chosen = neighbours_around(self.T_world_camera, target, 1 / float(np.median(inverse_depth)), frames)
+        chosen = neighbours_around(
+            self.T_world_camera, target, 1 / float(np.median(inverse_depth)), frames
+        )
         known = around | self._greys([n for n in chosen if n not in around], camera)
         others = {n: known[n] for n in chosen if n in known}
         if not others:
             return None
-        return shrunk(*refined_label(grey, [*others.values()], K, self._motion(target, others), inverse_depth), finer)
+        return shrunk(
+            *refined_label(
+                grey, [*others.values()], K, self._motion(target, others), inverse_depth
+            ),
+            finer,
+        )
 
     def _greys(self, frames: Iterable[int], camera: Camera) -> dict[int, Grey]:
         """Those frames that can be read."""
@@ -197,7 +235,9 @@ class DriveLabels:
 
     def _motion(self, target: int, others: Iterable[int]) -> NDArray[np.float64]:
         """``T_other_target`` ``(N, 4, 4)``."""
-        return np.asarray(np.linalg.inv(self.T_world_camera[[*others]]) @ self.T_world_camera[target])
+        return np.asarray(
+            np.linalg.inv(self.T_world_camera[[*others]]) @ self.T_world_camera[target]
+        )
 
     def _image(self, index: int, camera: Camera) -> NDArray[np.uint8] | None:
         """A frame at a camera's size; None where it cannot be read."""
@@ -240,7 +280,9 @@ class ManyViewTeacher:
         """Where the labels of a recording are kept."""
         if recording.key not in self._drives:
             if recording.labels is not None:
-                drive = DriveLabels(recording, recording.labels, self._size, self._stride, True, recording.skipped)
+                drive = DriveLabels(
+                    recording, recording.labels, self._size, self._stride, True, recording.skipped
+                )
             else:
                 # of the camera, the names, sizes and times of the images, and the version of this file
                 stats = [(path.name, path.stat()) for path in sorted(set(recording.images))]
@@ -256,11 +298,17 @@ class ManyViewTeacher:
         drive, target = self.drive(recording), first + sources // 2
         motion = snippet_motion(drive.T_world_camera, first, sources).astype(np.float32)
         if not self._with_depth:
-            return TeacherStructure(motion, np.zeros(self._size, np.float16), np.full(self._size, np.inf, np.float16))
-        least, most = self._labels.get((*recording.key, target), lambda: np.stack(drive.label(target)))
+            return TeacherStructure(
+                motion, np.zeros(self._size, np.float16), np.full(self._size, np.inf, np.float16)
+            )
+        least, most = self._labels.get(
+            (*recording.key, target), lambda: np.stack(drive.label(target))
+        )
         return TeacherStructure(motion, least, most)
 
-    def prepare(self, recordings: Sequence[Recording], sources: int, weights: str, progress: Progress) -> None:
+    def prepare(
+        self, recordings: Sequence[Recording], sources: int, weights: str, progress: Progress
+    ) -> None:
         """Compute what is not there yet, in as many processes as there are cores; a few labels in this one.
 
         Of several programs with one folder (the processes of a training on several devices) one computes and the
@@ -275,8 +323,15 @@ class ManyViewTeacher:
             without = [drive for drive in drives if not drive.poses_file.is_file()]
             tasks: list[tuple[DriveLabels, list[int]]] = []
             for drive in drives if self._with_depth else ():
-                missing = [target for target in drive.targets(sources) if not drive.label_file(target).is_file()]
-                tasks += [(drive, missing[first : first + _CHUNK]) for first in range(0, len(missing), _CHUNK)]
+                missing = [
+                    target
+                    for target in drive.targets(sources)
+                    if not drive.label_file(target).is_file()
+                ]
+                tasks += [
+                    (drive, missing[first : first + _CHUNK])
+                    for first in range(0, len(missing), _CHUNK)
+                ]
             for drive in (*without, *(drive for drive, _ in tasks)):
                 if drive.compact:
                     raise TrainingError(
@@ -292,7 +347,10 @@ class ManyViewTeacher:
                     progress("teacher: depth", drive.measure_labels(chunk), total)
             elif tasks:
                 with processes("measures labels") as pool:
-                    running = [pool.submit(drive.measure_labels, chunk, self._learned) for drive, chunk in tasks]
+                    running = [
+                        pool.submit(drive.measure_labels, chunk, self._learned)
+                        for drive, chunk in tasks
+                    ]
                     for future in as_completed(running):
                         done += future.result()
                         progress("teacher: depth", done, total)
@@ -305,7 +363,9 @@ def _grey(image: NDArray[np.uint8]) -> Grey:
 SMALLEST = 0.002  # inverse depth of code 0, one over camera heights: 800 m; code 255 is 0.7 m
 STEP = 0.0275  # of the logarithm of the inverse depth between codes
 LEAST_SIGMA = 0.01  # of the logarithm, of the first kind of measured pixel
-_UNKNOWN, _AT_LEAST, _AT_MOST, _MEASURED = range(4)  # kinds of pixels; each further kind has twice the sigma
+_UNKNOWN, _AT_LEAST, _AT_MOST, _MEASURED = range(
+    4
+)  # kinds of pixels; each further kind has twice the sigma
 _WIDEST = 8
 _LOSSLESS = [cv2.IMWRITE_WEBP_QUALITY, 101]
 
@@ -329,7 +389,10 @@ def encode(least: NDArray[np.floating], most: NDArray[np.floating]) -> bytes:
     # an unknown pixel has the code of the known one left of it: small when compressed
     known_before = np.maximum.accumulate(np.where(known, np.arange(least.shape[1]), 0), axis=1)
     picture = np.zeros((*least.shape, 3), np.uint8)
-    picture[..., 0], picture[..., 1] = kind, np.take_along_axis(code.astype(np.uint8), known_before, axis=1)
+    picture[..., 0], picture[..., 1] = (
+        kind,
+        np.take_along_axis(code.astype(np.uint8), known_before, axis=1),
+    )
     return bytes(cv2.imencode(".webp", picture, _LOSSLESS)[1])
 
 
@@ -346,4 +409,6 @@ def decode(data: bytes) -> tuple[Bound, Bound]:
     ratio_least = np.where(bounded_below, np.exp(-sigma), 0).astype(np.float32)
     ratio_most = np.where(bounded_above, np.exp(sigma), np.inf).astype(np.float32)
     kind, middle = picture[..., 0], value.astype(np.float32)[picture[..., 1]]
-    return (middle * ratio_least[kind]).astype(np.float16), (middle * ratio_most[kind]).astype(np.float16)
+    return (middle * ratio_least[kind]).astype(np.float16), (middle * ratio_most[kind]).astype(
+        np.float16
+    )

@@ -31,7 +31,10 @@ from erfsfm.data.window import Snippet
 from erfsfm.geometry import Camera
 
 INDEX_FILE = "prepared.yaml"
-_POSES, _LABELS = "poses.txt", "labels"  # of a recording: true poses of its camera (KITTI), and the teacher's
+_POSES, _LABELS = (
+    "poses.txt",
+    "labels",
+)  # of a recording: true poses of its camera (KITTI), and the teacher's
 QUALITY = 90  # of the JPEG images: 16 kB each at 416x128
 _MOST_FRAMES = 10**6  # of one recording: a day at ten frames a second
 
@@ -64,7 +67,9 @@ def read_prepared(root: Path) -> list[Recording]:
     for place, entry in enumerate(index.recordings):
         folder = root / f"{place:04d}"
         numbers, poses = range(entry.start, entry.start + entry.frames), folder / _POSES
-        depth = tuple(path if (path := _file(folder, "depth", n)).is_file() else None for n in numbers)
+        depth = tuple(
+            path if (path := _file(folder, "depth", n)).is_file() else None for n in numbers
+        )
         recording = Recording(
             entry.name,
             tuple(_file(folder, "images", n) for n in numbers),
@@ -100,7 +105,9 @@ def write_prepared(
         progress: told of the stage, what is done, and of how many.
     """
     length, middle = network.sources + 1, network.sources // 2
-    snippets = [snippet.recording.part(snippet.first, snippet.first + length) for snippet in held_out]
+    snippets = [
+        snippet.recording.part(snippet.first, snippet.first + length) for snippet in held_out
+    ]
     recordings = [*training, *snippets]
     unfinished = output.with_name(f".{output.name}.{os.getpid()}.partial")
     try:
@@ -156,7 +163,9 @@ def _write_images(folder: Path, recording: Recording, network: NetworkConfig) ->
 
 def _write_depth(folder: Path, frame: int, depth_m: NDArray[np.float32]) -> None:
     values = np.clip(np.rint(depth_m * 256), 0, 65535).astype(np.uint16)
-    write_atomically(_file(folder, "depth", frame), bytes(cv2.imencode(".png", values)[1]), sync=False)
+    write_atomically(
+        _file(folder, "depth", frame), bytes(cv2.imencode(".png", values)[1]), sync=False
+    )
 
 
 def _write_labels(measured: DriveLabels, folder: Path, network: NetworkConfig) -> None:

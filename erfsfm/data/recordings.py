@@ -24,7 +24,9 @@ from erfsfm.geometry import Camera
 
 logger = logging.getLogger(__name__)
 
-_kept: dict[Path, Image] = {}  # of this process: the frames ``(N, height, width, 3)`` of each video at one size
+_kept: dict[
+    Path, Image
+] = {}  # of this process: the frames ``(N, height, width, 3)`` of each video at one size
 
 
 class Video:
@@ -132,18 +134,24 @@ class Recording:
     @property
     def exact(self) -> bool:
         """Whether all depth is known, in camera heights too: that of a simulated world with depth maps."""
-        return self.camera_height_m is not None and self.depth is not None and None not in self.depth
+        return (
+            self.camera_height_m is not None and self.depth is not None and None not in self.depth
+        )
 
     def true_depth(self, index: int) -> NDArray[np.float32] | None:
         """z-depth in metres ``(H, W)``, 0 where unknown; None where the frame has no depth."""
         path = None if self.depth is None else self.depth[index]
-        return None if path is None else read_depth_map(path, self.depth_per_metre).astype(np.float32)
+        return (
+            None if path is None else read_depth_map(path, self.depth_per_metre).astype(np.float32)
+        )
 
     def shrunk_depth(self, index: int, height: int, width: int) -> NDArray[np.float32]:
         """As `true_depth` of a frame that has it, by the nearest pixels at another size, of ``image`` as a rule."""
         depth_m = self.true_depth(index)
         assert depth_m is not None, "the frame has depth"
-        return np.asarray(cv2.resize(depth_m, (width, height), interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
+        return np.asarray(
+            cv2.resize(depth_m, (width, height), interpolation=cv2.INTER_NEAREST_EXACT), np.float32
+        )
 
     def true_poses(self, fidelity: Fidelity = "default") -> NDArray[np.float64] | None:
         """``T_world_camera`` ``(N, 4, 4)``, or None where the recording has no poses.
@@ -155,14 +163,18 @@ class Recording:
         try:
             numbers = np.loadtxt(self.poses_file, ndmin=2)
             if numbers.shape[1] != 12 or not np.isfinite(numbers).all():
-                raise ValueError(f"it has {numbers.shape[1]} columns, or a number that is not finite")
+                raise ValueError(
+                    f"it has {numbers.shape[1]} columns, or a number that is not finite"
+                )
         except (OSError, ValueError) as error:
             raise DataError(f"{self.poses_file} must hold 12 numbers a row: {error}") from error
         rows = numbers.reshape(-1, 3, 4)
         first = self.skipped if len(rows) == self.stored else self.start
         rows = rows[first : first + len(self)]
         if len(rows) < len(self):
-            raise DataError(f"{self.poses_file} ends before frame {self.start + len(self)} of {self.name}")
+            raise DataError(
+                f"{self.poses_file} ends before frame {self.start + len(self)} of {self.name}"
+            )
         T_world_camera = np.tile(np.eye(4), (len(rows), 1, 1))
         T_world_camera[:, :3] = rows
         if fidelity == "default":
@@ -181,6 +193,11 @@ class Recording:
 def split_at_gaps(whole: Recording, files: NumberedFiles) -> list[Recording]:
     """The parts of a recording between missing frame numbers, each with the numbers of its files."""
     if files.gaps():
-        logger.warning("%s: %s; split into %d parts", files.paths[0].parent, files.describe_gaps(), len(files.parts()))
+        logger.warning(
+            "%s: %s; split into %d parts",
+            files.paths[0].parent,
+            files.describe_gaps(),
+            len(files.parts()),
+        )
     parts = [replace(whole.part(a, b), start=files.first + files.rows[a]) for a, b in files.parts()]
     return [replace(part, stored=len(files.paths)) for part in parts]

@@ -24,7 +24,14 @@ from erfsfm.data.augmentation import as_tensors, in_heights, single_image, train
 from erfsfm.data.many_view_teacher import Learned, ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.split import usable
-from erfsfm.data.window import ArrayCache, Snippet, TeacherStructure, first_readable, load_window, snippet_motion
+from erfsfm.data.window import (
+    ArrayCache,
+    Snippet,
+    TeacherStructure,
+    first_readable,
+    load_window,
+    snippet_motion,
+)
 from erfsfm.geometry import Camera
 
 _VALIDATED = 40  # snippets: as many as the shipped weights were chosen by
@@ -48,11 +55,19 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         self._first_draw = first_draw
         self._rank = rank
         size = (config.network.height, config.network.width)
-        depth_mb = config.data.cache_mb // 5 if config.data.exact > 0 or config.teacher.exact or imitated else 0
-        images_mb = config.data.cache_mb - depth_mb - (0 if many_views is None else labels_mb(config.data))
+        depth_mb = (
+            config.data.cache_mb // 5
+            if config.data.exact > 0 or config.teacher.exact or imitated
+            else 0
+        )
+        images_mb = (
+            config.data.cache_mb - depth_mb - (0 if many_views is None else labels_mb(config.data))
+        )
         self._cache = ArrayCache(images_mb, (*size, 3), np.uint8)
         self._unreadable: set[str] = set()
-        self._depth = ArrayCache(depth_mb, size, np.float32)  # true depth, inverse depth that is imitated
+        self._depth = ArrayCache(
+            depth_mb, size, np.float32
+        )  # true depth, inverse depth that is imitated
         self._exact_labels = ExactLabels(self._depth)
         self._many_views, self._imitated = many_views, imitated
         length = config.network.sources + 1
@@ -65,15 +80,23 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
                 raise DataError(f"data.weights names '{prefix}', but no recording starts with it")
         for name in names:
             if weights and not name.startswith(tuple(weights)):
-                raise DataError(f"data.weights gives '{name}' no weight: name it there, or leave its data set out")
-        self._probabilities = chances(self._measured, [len(one) - length + 1 for one in self._measured], weights)
-        self._exact_probabilities = chances(self._exact, [1] * len(self._exact), weights)  # however long they are
+                raise DataError(
+                    f"data.weights gives '{name}' no weight: name it there, or leave its data set out"
+                )
+        self._probabilities = chances(
+            self._measured, [len(one) - length + 1 for one in self._measured], weights
+        )
+        self._exact_probabilities = chances(
+            self._exact, [1] * len(self._exact), weights
+        )  # however long they are
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
         worker = get_worker_info()
         index, count = (worker.id, worker.num_workers) if worker else (0, 1)
         batch, processes = self._config.training.batch, self._config.training.devices
-        for number, first in enumerate(range(self._first_draw + self._rank * batch, self._draws, batch * processes)):
+        for number, first in enumerate(
+            range(self._first_draw + self._rank * batch, self._draws, batch * processes)
+        ):
             if number % count == index:
                 yield from (self.draw(i) for i in range(first, min(first + batch, self._draws)))
 
@@ -107,7 +130,9 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         """Those of a sample in time order: the snippet's, or its target alone."""
         sources = self._config.network.sources
         if self._config.single_images:
-            return load_window(self._cache, Snippet(snippet.recording, snippet.first + sources // 2), 1)
+            return load_window(
+                self._cache, Snippet(snippet.recording, snippet.first + sources // 2), 1
+            )
         return load_window(self._cache, snippet, sources + 1)
 
     def _chosen(self, rng: np.random.Generator) -> Iterator[Snippet]:
@@ -115,10 +140,14 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         sources = self._config.network.sources
         while True:
             recording = self._measured[int(rng.choice(len(self._measured), p=self._probabilities))]
-            starts = range(len(recording) - sources)  # first frames of the snippets that may be drawn
+            starts = range(
+                len(recording) - sources
+            )  # first frames of the snippets that may be drawn
             if self._many_views is not None:
                 targets = self._many_views.drive(recording).targets(sources)
-                starts = range(targets.start - sources // 2, targets.stop - sources // 2, targets.step)
+                starts = range(
+                    targets.start - sources // 2, targets.stop - sources // 2, targets.step
+                )
             yield Snippet(recording, starts[int(rng.integers(len(starts)))])
 
     def _structure(self, snippet: Snippet) -> TeacherStructure | None:
@@ -126,19 +155,29 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         recording, sources = snippet.recording, self._config.network.sources
         if self._imitated is not None:
             target = snippet.first + sources // 2
-            bound = self._depth.get((*recording.key, target), partial(self._by_imitated, recording, target))
+            bound = self._depth.get(
+                (*recording.key, target), partial(self._by_imitated, recording, target)
+            )
             return TeacherStructure(np.full((sources, 4, 4), np.nan, np.float32), bound, bound)
         if self._many_views is not None:
             return self._many_views.structure(recording, snippet.first, sources)
-        return self._exact_labels.structure(recording, snippet.first, sources) if self._config.teacher.exact else None
+        return (
+            self._exact_labels.structure(recording, snippet.first, sources)
+            if self._config.teacher.exact
+            else None
+        )
 
     def _by_imitated(self, recording: Recording, index: int) -> NDArray[np.float32]:
         """Inverse depth in camera heights; of a file as it is stored, in which a network sees more."""
         assert self._imitated is not None, "a network is imitated"
         (height, width), stored = self._depth.shape, recording.camera
         # a video has all of its frames decoded at one size
-        image = recording.image(index, *((stored.height, stored.width) if recording.video is None else (height, width)))
-        inverse_depth = cv2.resize(self._imitated(image), (width, height), interpolation=cv2.INTER_AREA)
+        image = recording.image(
+            index, *((stored.height, stored.width) if recording.video is None else (height, width))
+        )
+        inverse_depth = cv2.resize(
+            self._imitated(image), (width, height), interpolation=cv2.INTER_AREA
+        )
         return in_heights(np.asarray(inverse_depth), self._camera(recording), self._config)
 
 
@@ -151,9 +190,15 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
 
     def __init__(self, recordings: Sequence[Recording], config: ExperimentConfig) -> None:
         self._network = config.network
-        self._cache = ArrayCache(config.data.cache_mb, (self._network.height, self._network.width, 3), np.uint8)
+        self._cache = ArrayCache(
+            config.data.cache_mb, (self._network.height, self._network.width, 3), np.uint8
+        )
         length = config.network.sources + 1
-        windows = [Snippet(r, first) for r in usable(recordings, length) for first in range(len(r) - length + 1)]
+        windows = [
+            Snippet(r, first)
+            for r in usable(recordings, length)
+            for first in range(len(r) - length + 1)
+        ]
         chosen = np.linspace(0, len(windows) - 1, min(_VALIDATED, len(windows)))
         self.snippets, reasons = [], []
         for snippet in (windows[int(i)] for i in chosen.round()):
@@ -171,12 +216,16 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
         snippet, network = self.snippets[item], self._network
         recording = snippet.recording
         images, depth = self._read(snippet)
-        sample = as_tensors(images, recording.camera.resized(network.width, network.height, network.fidelity).K)
+        sample = as_tensors(
+            images, recording.camera.resized(network.width, network.height, network.fidelity).K
+        )
         if depth is not None:
             sample["depth"] = torch.from_numpy(depth)
         T_world_camera = recording.true_poses()
         if T_world_camera is not None:
-            sample["T_source_target"] = torch.from_numpy(snippet_motion(T_world_camera, snippet.first, network.sources))
+            sample["T_source_target"] = torch.from_numpy(
+                snippet_motion(T_world_camera, snippet.first, network.sources)
+            )
         return sample
 
     def _read(self, snippet: Snippet) -> tuple[list[NDArray[np.uint8]], NDArray[np.float32] | None]:
@@ -190,12 +239,16 @@ def labels_mb(config: DataConfig) -> int:
     return config.cache_mb * 2 // 5
 
 
-def chances(recordings: Sequence[Recording], sizes: Sequence[int], weights: Mapping[str, float]) -> NDArray[np.float64]:
+def chances(
+    recordings: Sequence[Recording], sizes: Sequence[int], weights: Mapping[str, float]
+) -> NDArray[np.float64]:
     """Chance of each recording: by its size among those of its prefix, and by the weight of the prefix."""
     each = np.array(sizes, dtype=np.float64)
     total = np.zeros(len(recordings)) if weights else each
     for prefix, weight in weights.items():
-        chosen = np.array([recording.name.startswith(prefix) for recording in recordings], dtype=bool)
+        chosen = np.array(
+            [recording.name.startswith(prefix) for recording in recordings], dtype=bool
+        )
         if chosen.any():
             total += np.where(chosen, weight * each / each[chosen].sum(), 0)
     return np.asarray(total / total.sum()) if len(recordings) else total
@@ -211,11 +264,15 @@ class ExactLabels:
         self._depth = cache
         self._poses: dict[tuple[str, Path], NDArray[np.float64] | None] = {}
 
-    def bounds(self, recording: Recording, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def bounds(
+        self, recording: Recording, index: int
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Least and most inverse depth of a frame, each ``(H, W)``."""
         height_m = recording.camera_height_m
         assert height_m is not None, "recordings are exact"
-        depth_m = self._depth.get((*recording.key, index), partial(recording.shrunk_depth, index, *self._depth.shape))
+        depth_m = self._depth.get(
+            (*recording.key, index), partial(recording.shrunk_depth, index, *self._depth.shape)
+        )
         seen = depth_m > 0
         beyond = height_m / FARTHEST_M if recording.name.startswith("simulated/") else np.inf
         most = np.where(seen, height_m / np.where(seen, depth_m, 1), beyond).astype(np.float32)
@@ -233,7 +290,9 @@ class ExactLabels:
         return TeacherStructure(T_source_target, *self.bounds(recording, first + sources // 2))
 
 
-def by_label(recordings: Sequence[Recording], config: ExperimentConfig) -> tuple[list[Recording], list[Recording]]:
+def by_label(
+    recordings: Sequence[Recording], config: ExperimentConfig
+) -> tuple[list[Recording], list[Recording]]:
     """The recordings of which single images with exact depth are drawn, and those of which snippets are."""
     exact = [recording for recording in recordings if recording.exact]
     measured = [recording for recording in recordings if not recording.exact]

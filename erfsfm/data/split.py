@@ -35,7 +35,9 @@ logger = logging.getLogger(__name__)
 
 _SHORTEST_STOP = 10  # frames of an own recording
 _SHORTEST_END = 20  # frames: fewer give neither a trajectory with its scale nor depth by many views
-_DEFAULT_VALIDATION = DataConfig().validation  # may match no recording: the data need not be simulated
+_DEFAULT_VALIDATION = (
+    DataConfig().validation
+)  # may match no recording: the data need not be simulated
 _FRAMES = re.compile(r"(?P<recording>.+)\[(?P<runs>[\d:, ]+)\]")
 _RUN = re.compile(r"(?P<first>\d+)(?::(?P<stop>\d+)(?::(?P<step>[1-9]\d*))?)?")
 
@@ -43,8 +45,12 @@ _RUN = re.compile(r"(?P<first>\d+)(?::(?P<stop>\d+)(?::(?P<step>[1-9]\d*))?)?")
 class Split(Section):
     """A division of recordings; a missing list is empty."""
 
-    train: list[str] = Field(default_factory=list, description="recordings or frame ranges; none: all that are found")
-    validation: list[str] = Field(default_factory=list, description="recordings or frame ranges that only validate")
+    train: list[str] = Field(
+        default_factory=list, description="recordings or frame ranges; none: all that are found"
+    )
+    validation: list[str] = Field(
+        default_factory=list, description="recordings or frame ranges that only validate"
+    )
     test: list[str] = Field(default_factory=list, description="recordings or single frames")
 
     @property
@@ -58,9 +64,13 @@ class Split(Section):
         frames: list[tuple[str, int]] = []
         for name in self.test:
             match = _FRAMES.fullmatch(name.strip())
-            runs = [_RUN.fullmatch(text.strip()) for text in match["runs"].split(",")] if match else []
+            runs = (
+                [_RUN.fullmatch(text.strip()) for text in match["runs"].split(",")] if match else []
+            )
             if match is None or None in runs:
-                raise DataError(f"'{name}' names no single frames: wanted kind/recording[0:64:3, 69, 72]")
+                raise DataError(
+                    f"'{name}' names no single frames: wanted kind/recording[0:64:3, 69, 72]"
+                )
             for run in filter(None, runs):
                 first = int(run["first"])
                 numbers = range(first, int(run["stop"] or first + 1), int(run["step"] or 1))
@@ -76,7 +86,9 @@ def read_split_file(name_or_path: str) -> Split:
         folders = wheel / "splits", source.parent / "splits"
         shipped = {file.stem: file for folder in folders for file in sorted(folder.glob("*.yaml"))}
         if name_or_path not in shipped:
-            raise DataError(f"no split '{name_or_path}': neither a file nor one of {', '.join(shipped)}")
+            raise DataError(
+                f"no split '{name_or_path}': neither a file nor one of {', '.join(shipped)}"
+            )
         path = shipped[name_or_path]
     return read_model(Split, path, DataError, "is no split of train, validation and test")
 
@@ -85,7 +97,9 @@ def usable(recordings: Sequence[Recording], length: int) -> list[Recording]:
     """Recordings that hold at least one snippet; ``DataError`` where none does."""
     kept = [r for r in recordings if len(r) >= length]
     if not kept:
-        raise DataError(f"a snippet needs {length} consecutive frames; found {_lengths(recordings) or 'no recording'}")
+        raise DataError(
+            f"a snippet needs {length} consecutive frames; found {_lengths(recordings) or 'no recording'}"
+        )
     return kept
 
 
@@ -103,19 +117,29 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     never = [FrameRange.parse(name) for name in (*excluded, *split.test_recordings)]
     unknown = [str(each) for each in never if each.recording.partition("/")[0] not in KINDS]
     if unknown:
-        raise DataError(f"data.exclude names '{unknown[0]}', but names of recordings begin with {_some(KINDS)}")
+        raise DataError(
+            f"data.exclude names '{unknown[0]}', but names of recordings begin with {_some(KINDS)}"
+        )
     found = [recording for root in config.roots for recording in discover(root)]
     names = _some([recording.name for recording in found])
     for key, span in zip(config.ranges, ranges):
         if not any(_spans(recording, [span]) for recording in found):
-            raise DataError(f"data.ranges names '{key}', but no recording has that name; found {names}")
+            raise DataError(
+                f"data.ranges names '{key}', but no recording has that name; found {names}"
+            )
     _require_begun(found, [*ranges, *listed, *held_out])
     training: list[Recording] = []
     validation: list[Recording] = []
     for recording in found:
         validation += _parts(recording, held_out)
-        forbidden = [*held_out, *never, *(scenes if recording.name.startswith("kitti_raw/") else [])]
-        chosen = next((each for each in (ranges, listed) if _spans(recording, each)), None)  # ranges before a list
+        forbidden = [
+            *held_out,
+            *never,
+            *(scenes if recording.name.startswith("kitti_raw/") else []),
+        ]
+        chosen = next(
+            (each for each in (ranges, listed) if _spans(recording, each)), None
+        )  # ranges before a list
         whole = [] if listed else [recording]
         for part in whole if chosen is None else _parts(recording, chosen):
             training += _rest(part, forbidden)
@@ -127,20 +151,28 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     if config.validation_share > 0:
         training, ends = _ends_split_off(training, config.validation_share)
         validation += ends
-    if not validation and (split.validation or config.validation != _DEFAULT_VALIDATION) and config.validation:
+    if (
+        not validation
+        and (split.validation or config.validation != _DEFAULT_VALIDATION)
+        and config.validation
+    ):
         wanted = _some([*config.validation, *split.validation])
         raise DataError(
             f"nothing to validate on: data.validation and data.split name {wanted}; found {names}; name one of "
             "these, or train without validation by data.validation=[]"
         )
     named = config.validation if config.validation != _DEFAULT_VALIDATION else []
-    absent = [name for name in named if not any(FrameRange.parse(name).counted_in(r.name) for r in found)]
+    absent = [
+        name for name in named if not any(FrameRange.parse(name).counted_in(r.name) for r in found)
+    ]
     if absent:
         logger.warning("data.validation names %s, which is not among the data", _some(absent))
     return _without_stops(training), _without_stops(validation)
 
 
-def _ends_split_off(recordings: list[Recording], share: float) -> tuple[list[Recording], list[Recording]]:
+def _ends_split_off(
+    recordings: list[Recording], share: float
+) -> tuple[list[Recording], list[Recording]]:
     """The recordings without their last parts, and these."""
     kept, ends = [], []
     for recording in recordings:
@@ -181,7 +213,11 @@ def _rest(recording: Recording, ranges: Sequence[FrameRange]) -> list[Recording]
     """The parts of a recording before, between and after frame ranges."""
     rest = [recording]
     for span in _spans(recording, ranges):
-        sides = (side for part in rest for side in (part.within(0, span.start), part.within(span.stop, EVERYTHING)))
+        sides = (
+            side
+            for part in rest
+            for side in (part.within(0, span.start), part.within(span.stop, EVERYTHING))
+        )
         rest = [part for part in sides if part is not None]
     return rest
 
@@ -206,12 +242,16 @@ def _without_stops(recordings: list[Recording]) -> list[Recording]:
             kept += moving_parts(recording)
         else:  # a doubled frame of an own video is no stop, and its drive stays whole for the teacher
             shortest = min(_SHORTEST_END, len(recording))
-            kept += [part for part in moving_parts(recording, _SHORTEST_STOP) if len(part) >= shortest]
+            kept += [
+                part for part in moving_parts(recording, _SHORTEST_STOP) if len(part) >= shortest
+            ]
     before = sum(map(len, recordings))
     if (lost := before - sum(map(len, kept))) > 0:
         logger.info("left out %d of %d frames in which the camera stands still", lost, before)
     if recordings and not kept:
-        raise DataError("the camera stands still in every frame found: nothing can be learned from them")
+        raise DataError(
+            "the camera stands still in every frame found: nothing can be learned from them"
+        )
     return kept
 
 
@@ -250,7 +290,9 @@ def _speeds(oxts: Path, start: int, frames: int) -> NDArray[np.float64]:
     if len(reasons) == frames:
         raise DataError(reasons[0])
     if reasons:
-        logger.warning("%d of %d frames have no speed and are kept: %s", len(reasons), frames, reasons[0])
+        logger.warning(
+            "%d of %d frames have no speed and are kept: %s", len(reasons), frames, reasons[0]
+        )
     return speeds
 
 
@@ -265,7 +307,9 @@ def _unchanged(recording: Recording) -> NDArray[np.bool_]:
     previous: NDArray[np.float32] | None = None
     for index in range(len(recording)):
         try:
-            image = cv2.cvtColor(recording.image(index, rows, columns), cv2.COLOR_RGB2GRAY).astype(np.float32)
+            image = cv2.cvtColor(recording.image(index, rows, columns), cv2.COLOR_RGB2GRAY).astype(
+                np.float32
+            )
         except DataError:
             continue  # whoever reads the snippets names it
         if previous is not None:

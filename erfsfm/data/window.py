@@ -52,7 +52,9 @@ class TeacherStructure:
     most: NDArray[np.floating]
 
 
-def snippet_motion(T_world_camera: NDArray[np.float64], first: int, sources: int) -> NDArray[np.float64]:
+def snippet_motion(
+    T_world_camera: NDArray[np.float64], first: int, sources: int
+) -> NDArray[np.float64]:
     """``T_source_target`` ``(N, 4, 4)`` of the snippet that begins at pose ``first`` of ``(frames, 4, 4)``."""
     target = first + sources // 2
     others = np.delete(np.arange(first, first + sources + 1), sources // 2)
@@ -68,7 +70,9 @@ def load_window(cache: ArrayCache, snippet: Snippet, length: int) -> list[NDArra
     ]
 
 
-def first_readable(snippets: Iterator[Snippet], read: Callable[[Snippet], T], named: set[str]) -> tuple[Snippet, T]:
+def first_readable(
+    snippets: Iterator[Snippet], read: Callable[[Snippet], T], named: set[str]
+) -> tuple[Snippet, T]:
     """The first snippet that can be read, and what was read of it; ``DataError`` where 20 in a row cannot.
 
     The reasons of those passed over are logged once each, the first ten of them, which ``named`` remembers.
@@ -115,7 +119,11 @@ class ArrayCache:
             return self._place(slot).copy()
         array = make()
         if self._capacity > 0:
-            slot = len(self._slots) if len(self._slots) < self._capacity else self._slots.popitem(last=False)[1]
+            slot = (
+                len(self._slots)
+                if len(self._slots) < self._capacity
+                else self._slots.popitem(last=False)[1]
+            )
             self._place(slot)[:] = array
             self._slots[key] = slot
         return array

@@ -67,7 +67,9 @@ def depth_errors(
         ValueError: the maps differ in size.
     """
     if predicted.shape != true_depth.shape:
-        raise ValueError(f"predicted depth must have the truth's shape {true_depth.shape}; got {predicted.shape}")
+        raise ValueError(
+            f"predicted depth must have the truth's shape {true_depth.shape}; got {predicted.shape}"
+        )
     mask = valid_pixels(true_depth, cap_m, crop)
     if not mask.any():
         return None

@@ -47,7 +47,9 @@ def read_split(split: str, root: Path) -> list[RawFrame]:
         root: of KITTI raw: the folder of the dates, a date, or a drive.
     """
     if not root.is_dir():
-        raise DataError(f"no data set at {root}: wanted the folder that holds KITTI's dates (2011_09_26, ...)")
+        raise DataError(
+            f"no data set at {root}: wanted the folder that holds KITTI's dates (2011_09_26, ...)"
+        )
     base = root.resolve()
     if base.name.endswith("_sync"):
         base = base.parents[1]
@@ -58,7 +60,9 @@ def read_split(split: str, root: Path) -> list[RawFrame]:
         try:
             lines = read_text(path).splitlines()
         except (OSError, UnicodeDecodeError) as error:
-            raise DataError(f"split {path} cannot be read: it is no text of a frame a line ({error})") from error
+            raise DataError(
+                f"split {path} cannot be read: it is no text of a frame a line ({error})"
+            ) from error
         frames = [RawFrame.parse(line, base) for line in lines if line.strip()]
     else:
         frames = []
@@ -93,7 +97,12 @@ def eigen_protocol(
     Raises:
         DataError: split, images, LiDAR or GPS/IMU missing or malformed, or a leak that was not allowed.
     """
-    compare = partial(depth_errors, cap_m=CAP_M, crop="garg", clipping="before" if fidelity == "paper" else "after")
+    compare = partial(
+        depth_errors,
+        cap_m=CAP_M,
+        crop="garg",
+        clipping="before" if fidelity == "paper" else "after",
+    )
     frames = read_split(split, root)
     leak = refuse_leak(networks, [frame.name for frame in frames], allow_leak)
     errors: dict[str, list[DepthErrors]] = {"gt-median": [], "pose": []}
@@ -118,11 +127,15 @@ def eigen_protocol(
         by_motion = compare(guess, truth, scaling=scale) if scale is not None else None
         if by_motion is not None:
             errors["pose"].append(by_motion)
-    rows = [_row("networks", scaling, found, len(frames), leak) for scaling, found in errors.items()]
+    rows = [
+        _row("networks", scaling, found, len(frames), leak) for scaling, found in errors.items()
+    ]
     return [*rows, _row("flat road", "gt-median", flat, len(frames), leak=False)]
 
 
-def _scale_of_motion(networks: DepthPosePredictor, frame: RawFrame, fidelity: Fidelity) -> float | None:
+def _scale_of_motion(
+    networks: DepthPosePredictor, frame: RawFrame, fidelity: Fidelity
+) -> float | None:
     """Mean of true over predicted distance to the sources; None for a still car, except in paper fidelity."""
     window = frame.window(networks.sources)
     true = displacements(frame, window)
@@ -133,14 +146,20 @@ def _scale_of_motion(networks: DepthPosePredictor, frame: RawFrame, fidelity: Fi
     return float(np.mean(true / np.maximum(predicted, 1e-12)))
 
 
-def _row(method: str, scaling: str, errors: Sequence[DepthErrors], wanted: int, leak: bool) -> dict[str, Any]:
+def _row(
+    method: str, scaling: str, errors: Sequence[DepthErrors], wanted: int, leak: bool
+) -> dict[str, Any]:
     row: dict[str, Any] = {"method": method, "scaling": scaling}
     if not errors:
         row |= {"abs_rel": None, "abs_rel_reason": "the car stands still in every frame"}
         return row | {"images": 0, "leak": leak}
     mean = asdict(mean_errors(list(errors)))
     row |= {key: value if np.isfinite(value) else None for key, value in mean.items()}
-    row |= {f"{key}_reason": "an image has no scale" for key, value in mean.items() if not np.isfinite(value)}
+    row |= {
+        f"{key}_reason": "an image has no scale"
+        for key, value in mean.items()
+        if not np.isfinite(value)
+    }
     scales = np.array([error.scale for error in errors])
     row["scale_spread"] = float(scales.std() / scales.mean()) if scales.any() else None
     return row | {"images": len(errors), "left_out": wanted - len(errors), "leak": leak}
@@ -173,7 +192,9 @@ class RawFrame:
         """Read a line of a split: an image's path, or ``drive frame`` with an optional ``l`` or ``r``."""
         match = _FRAME.fullmatch(line.strip())
         if match is None:
-            raise DataError(f"'{line.strip()}' names no frame: wanted the path of an image, or 2011_09_26_drive_0013 5")
+            raise DataError(
+                f"'{line.strip()}' names no frame: wanted the path of an image, or 2011_09_26_drive_0013 5"
+            )
         camera = int(match["camera"] or (3 if match["side"] == "r" else 2))
         return RawFrame(root, match["drive"], int(match["file"] or match["frame"]), camera)
 
@@ -189,24 +210,39 @@ class RawFrame:
 
     def image_path(self, index: int | None = None) -> Path:
         """The image of a frame of this drive, its own if None: png or jpg, whichever there is."""
-        stem = self.folder / f"image_0{self.camera}" / "data" / f"{self.index if index is None else index:010d}"
+        stem = (
+            self.folder
+            / f"image_0{self.camera}"
+            / "data"
+            / f"{self.index if index is None else index:010d}"
+        )
         for suffix in (".png", ".jpg"):
             if stem.with_suffix(suffix).is_file():
                 return stem.with_suffix(suffix)
-        raise DataError(f"{stem}.png (or .jpg) is missing: download the drive, or take the frame out of the split")
+        raise DataError(
+            f"{stem}.png (or .jpg) is missing: download the drive, or take the frame out of the split"
+        )
 
     def window(self, sources: int) -> list[int]:
         """The frame with ``sources`` others around it, shifted where the drive begins or ends."""
         folder = self.folder / f"image_0{self.camera}" / "data"
-        count = sum(1 for path in folder.iterdir() if path.suffix in (".png", ".jpg")) if folder.is_dir() else 0
+        count = (
+            sum(1 for path in folder.iterdir() if path.suffix in (".png", ".jpg"))
+            if folder.is_dir()
+            else 0
+        )
         half = sources // 2
         if count < sources + 1:
-            raise DataError(f"{self.drive} has {count} images; its poses need windows of {sources + 1}")
+            raise DataError(
+                f"{self.drive} has {count} images; its poses need windows of {sources + 1}"
+            )
         middle = min(max(self.index, half), count - half - 1)
         return list(range(middle - half, middle + half + 1))
 
 
-def lidar_depth(frame: RawFrame, size: tuple[int, int], fidelity: Fidelity = "default") -> NDArray[np.float32]:
+def lidar_depth(
+    frame: RawFrame, size: tuple[int, int], fidelity: Fidelity = "default"
+) -> NDArray[np.float32]:
     """z-depth of the LiDAR's points in the image of a frame, the nearest where several fall on one pixel.
 
     z [u v 1]^T = P_rect R_rect_00 T_cam_velo X; the pixel is round(u) - 1, the benchmark's counting from one
@@ -224,14 +260,19 @@ def lidar_depth(frame: RawFrame, size: tuple[int, int], fidelity: Fidelity = "de
         DataError: scan or calibration is missing or malformed, or the image has another shape than the camera.
     """
     height, width = size
-    date, path = frame.folder.parent, frame.folder / "velodyne_points" / "data" / f"{frame.index:010d}.bin"
+    date, path = (
+        frame.folder.parent,
+        frame.folder / "velodyne_points" / "data" / f"{frame.index:010d}.bin",
+    )
     camera = CalibrationFile(date / CAM_TO_CAM)
     R_rect = np.eye(4)
     R_rect[:3, :3] = camera.matrix("R_rect_00", (3, 3))
     T_cam_velo = CalibrationFile(date / VELO_TO_CAM).transform("R", "T")
     to_pixels = _rectified_camera(camera, frame, size) @ R_rect @ T_cam_velo
     if not path.is_file():
-        raise DataError(f"{path} is missing: the true depth of the split's frames comes from the LiDAR")
+        raise DataError(
+            f"{path} is missing: the true depth of the split's frames comes from the LiDAR"
+        )
     points = read_velodyne(path)
     points = points[points[:, 0] >= 0]
     projected = points @ to_pixels[:, :3].T + to_pixels[:, 3]
@@ -260,7 +301,9 @@ def displacements(frame: RawFrame, window: list[int]) -> FloatArray:
     try:
         times = np.array([stamps[i].strip() or "nothing" for i in window], "datetime64[ns]")
     except (ValueError, IndexError) as error:
-        raise DataError(f"{path} must hold a date and a time a frame: {' '.join(str(error).split())}") from error
+        raise DataError(
+            f"{path} must hold a date and a time a frame: {' '.join(str(error).split())}"
+        ) from error
     seconds = (times - times[0]) / np.timedelta64(1, "s")
     speeds = np.stack([velocity(folder / "data", i) for i in window])
     steps = 0.5 * (speeds[:-1] + speeds[1:]) * np.diff(seconds)[:, None]
@@ -271,7 +314,11 @@ def displacements(frame: RawFrame, window: list[int]) -> FloatArray:
 
 
 def _nearest(
-    rows: NDArray[np.int64], columns: NDArray[np.int64], z: FloatArray, size: tuple[int, int], fidelity: Fidelity
+    rows: NDArray[np.int64],
+    columns: NDArray[np.int64],
+    z: FloatArray,
+    size: tuple[int, int],
+    fidelity: Fidelity,
 ) -> FloatArray:
     if fidelity == "default":
         depth = np.full(size, np.inf)
@@ -290,7 +337,9 @@ def _nearest(
     return depth
 
 
-def flat_road_depth(frame: RawFrame, size: tuple[int, int], farthest_m: float) -> NDArray[np.float32]:
+def flat_road_depth(
+    frame: RawFrame, size: tuple[int, int], farthest_m: float
+) -> NDArray[np.float32]:
     """z-depth in metres ``(H, W)`` of a flat road under a level camera, and ``farthest_m`` where that is farther."""
     camera = _rectified_camera(CalibrationFile(frame.folder.parent / CAM_TO_CAM), frame, size)
     below_horizon = np.arange(1, size[0] + 1) - camera[1, 2]
@@ -298,14 +347,18 @@ def flat_road_depth(frame: RawFrame, size: tuple[int, int], farthest_m: float) -
     return np.repeat(np.minimum(depth, farthest_m).astype(np.float32)[:, None], size[1], axis=1)
 
 
-def _rectified_camera(camera: CalibrationFile, frame: RawFrame, size: tuple[int, int]) -> FloatArray:
+def _rectified_camera(
+    camera: CalibrationFile, frame: RawFrame, size: tuple[int, int]
+) -> FloatArray:
     """Points of the rectified camera 0 to pixels that count from one, ``(3, 4)``, at the image's size."""
     date = frame.folder.parent
     full_width, full_height = camera.matrix(f"S_rect_0{frame.camera}", (2,))
     P_rect = camera.matrix(f"P_rect_0{frame.camera}", (3, 4))
     scale_y, scale_x = size[0] / full_height, size[1] / full_width
     if abs(scale_x / scale_y - 1) > ASPECT_TOLERANCE:
-        raise DataError(f"{frame.image_path()} is cropped, or of another camera than that in {date}")
+        raise DataError(
+            f"{frame.image_path()} is cropped, or of another camera than that in {date}"
+        )
     # half a pixel stays half a pixel when pixels grow: u' = (u - 1/2) s + 1/2, counting from one
     resize = np.array([[scale_x, 0, (1 - scale_x) / 2], [0, scale_y, (1 - scale_y) / 2], [0, 0, 1]])
     rectified: FloatArray = resize @ P_rect

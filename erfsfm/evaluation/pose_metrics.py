@@ -58,20 +58,26 @@ def snippet_errors(
     predicted = np.asarray(T_first_k_pred, dtype=np.float64)
     truth = np.asarray(T_first_k_true, dtype=np.float64)
     if predicted.shape != truth.shape or predicted.ndim != 4 or predicted.shape[2:] != (4, 4):
-        raise ValueError(f"snippets must both have shape (S, K, 4, 4); got {predicted.shape}, {truth.shape}")
+        raise ValueError(
+            f"snippets must both have shape (S, K, 4, 4); got {predicted.shape}, {truth.shape}"
+        )
     count, length = predicted.shape[:2]
     if count == 0 or length < 2:
         raise ValueError(f"need at least one snippet of two frames; got {count} of {length}")
     p, g = predicted[..., :3, 3], truth[..., :3, 3]
     energy, true_energy = (p**2).sum(axis=(1, 2)), (g**2).sum(axis=(1, 2))
     scale = np.zeros(count)
-    np.divide((g * p).sum(axis=(1, 2)), energy, out=scale, where=energy > _STILL_RATIO**2 * true_energy)
+    np.divide(
+        (g * p).sum(axis=(1, 2)), energy, out=scale, where=energy > _STILL_RATIO**2 * true_energy
+    )
     ate = np.sqrt(((g - scale[:, None, None] * p) ** 2).sum(axis=(1, 2))) / length
     R_error = truth[..., :3, :3] @ np.swapaxes(predicted[..., :3, :3], -1, -2)
     re = rotation_angle(R_error).sum(axis=1) / length
     if fidelity == "paper":
         ate, re = np.pad(ate, (0, _PAPER_ZERO_ROWS)), np.pad(re, (0, _PAPER_ZERO_ROWS))
-    return SnippetErrors(float(ate.mean()), float(ate.std()), float(re.mean()), float(re.std()), count)
+    return SnippetErrors(
+        float(ate.mean()), float(ate.std()), float(re.mean()), float(re.std()), count
+    )
 
 
 def snippets_from_trajectory(T_world_camera: FloatArray, length: int = 5) -> FloatArray:
@@ -99,8 +105,15 @@ def snippet_from_network(T_source_target: FloatArray) -> FloatArray:
         ``T_first_k`` ``(..., N + 1, 4, 4)``.
     """
     sources = np.asarray(T_source_target, dtype=np.float64)
-    if sources.ndim < 3 or sources.shape[-2:] != (4, 4) or sources.shape[-3] % 2 or not sources.shape[-3]:
-        raise ValueError(f"T_source_target must have shape (..., N, 4, 4), N even; got {sources.shape}")
+    if (
+        sources.ndim < 3
+        or sources.shape[-2:] != (4, 4)
+        or sources.shape[-3] % 2
+        or not sources.shape[-3]
+    ):
+        raise ValueError(
+            f"T_source_target must have shape (..., N, 4, 4), N even; got {sources.shape}"
+        )
     T_k_target = np.insert(sources, sources.shape[-3] // 2, np.eye(4), axis=-3)
     T_first_k: FloatArray = T_k_target[..., :1, :, :] @ _invert(T_k_target)
     return T_first_k
@@ -112,7 +125,9 @@ def rotation_angle(R: FloatArray) -> FloatArray:
     angle = atan2(|vee(R - R^T)|, trace(R) - 1), both twice the sine and cosine
     """
     skew = R - np.swapaxes(R, -1, -2)
-    sine = np.linalg.norm(np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1), axis=-1)
+    sine = np.linalg.norm(
+        np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1), axis=-1
+    )
     angle: FloatArray = np.arctan2(sine, np.trace(R, axis1=-2, axis2=-1) - 1.0)
     return angle
 

@@ -38,7 +38,11 @@ from erfsfm.evaluation.depth_metrics import (
     standard_error,
 )
 from erfsfm.evaluation.eigen import RawFrame, lidar_depth
-from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network, snippets_from_trajectory
+from erfsfm.evaluation.pose_metrics import (
+    snippet_errors,
+    snippet_from_network,
+    snippets_from_trajectory,
+)
 from erfsfm.inference import DepthPosePredictor, refuse_leak
 
 _BASELINE = "median depth map"
@@ -72,10 +76,13 @@ def depth_protocol(
     """
     streets = [street for root in roots for street in find_streets(root)]
     leaks = {
-        name: [refuse_leak(each, street.seen, allow_leak) for street in streets] for name, each in networks.items()
+        name: [refuse_leak(each, street.seen, allow_leak) for street in streets]
+        for name, each in networks.items()
     }
     total, done = sum(len(street.frames) for street in streets), 0
-    errors: dict[str, list[list[DepthErrors]]] = {name: [[] for _ in streets] for name in (*networks, _BASELINE)}
+    errors: dict[str, list[list[DepthErrors]]] = {
+        name: [[] for _ in streets] for name in (*networks, _BASELINE)
+    }
     for place, street in enumerate(streets):
         to_draw = pictures
         for load in street.frames:
@@ -84,7 +91,10 @@ def depth_protocol(
             guesses = {name: each.depth(image) for name, each in networks.items()}
             if street.typical is not None:
                 guesses[_BASELINE] = street.typical
-            found = {name: depth_errors(guess, truth, CAP_M, street.crop) for name, guess in guesses.items()}
+            found = {
+                name: depth_errors(guess, truth, CAP_M, street.crop)
+                for name, guess in guesses.items()
+            }
             compared = {name: error for name, error in found.items() if error is not None}
             for name, error in compared.items():
                 errors[name][place].append(error)
@@ -95,7 +105,9 @@ def depth_protocol(
                 to_draw = None
             done += 1
         if not all(errors[name][place] for name in networks):
-            raise DataError(f"no depth between 0 and {CAP_M:g} m in {street.name}: nothing to compare with")
+            raise DataError(
+                f"no depth between 0 and {CAP_M:g} m in {street.name}: nothing to compare with"
+            )
     return _depth_rows(networks, streets, errors, leaks)
 
 
@@ -114,27 +126,40 @@ def _depth_rows(
             rows.append(_depth_row(name, compared, before) | {"leak": any(leaks.get(name, ()))})
     for place, street in enumerate(streets if len(streets) > 1 else ()):
         for name in networks:
-            row = _depth_row(name, [errors[name][place]], None if name == first else [errors[first][place]])
+            row = _depth_row(
+                name, [errors[name][place]], None if name == first else [errors[first][place]]
+            )
             rows.append(row | {"leak": leaks[name][place], "street": street.name})
     return rows
 
 
-def _picture(image: NDArray[np.uint8], depths: Iterable[NDArray[np.float32]], truth: NDArray[np.float32]) -> bytes:
+def _picture(
+    image: NDArray[np.uint8], depths: Iterable[NDArray[np.float32]], truth: NDArray[np.float32]
+) -> bytes:
     """A JPEG, image, depths in metres and truth below each other, at most `_PICTURE_WIDTH` wide; near is bright."""
     known = truth > 0
     nearness = [1 / depth for depth in depths] + [np.where(known, 1 / np.where(known, truth, 1), 0)]
     height, width = (round(n * min(1, _PICTURE_WIDTH / image.shape[1])) for n in image.shape[:2])
-    points = 1 + 2 * round(image.shape[1] / _PICTURE_WIDTH)  # of LiDAR, which would vanish in a smaller picture
+    points = 1 + 2 * round(
+        image.shape[1] / _PICTURE_WIDTH
+    )  # of LiDAR, which would vanish in a smaller picture
     nearness[-1] = cv2.dilate(nearness[-1], np.ones((points, points)))
     brightest = np.percentile(nearness[-1][nearness[-1] > 0], 98)
     shades = [np.clip(values / brightest * 255, 0, 255).astype(np.uint8) for values in nearness]
     coloured = [cv2.applyColorMap(shade, cv2.COLORMAP_MAGMA) for shade in shades]
-    rows = [cv2.resize(each, (width, height), interpolation=cv2.INTER_AREA) for each in (image[..., ::-1], *coloured)]
+    rows = [
+        cv2.resize(each, (width, height), interpolation=cv2.INTER_AREA)
+        for each in (image[..., ::-1], *coloured)
+    ]
     return bytes(cv2.imencode(".jpg", np.vstack(rows))[1])
 
 
 def pose_protocol(
-    networks: DepthPosePredictor, root: Path, sequences: Sequence[str], fidelity: Fidelity, allow_leak: bool
+    networks: DepthPosePredictor,
+    root: Path,
+    sequences: Sequence[str],
+    fidelity: Fidelity,
+    allow_leak: bool,
 ) -> list[dict[str, Any]]:
     """Five-frame snippets of each sequence, or of a part of it (``00[250:300]``): the networks, the pose network alone
     where its guess is the start of a measurement, and constant velocity straight ahead.
@@ -151,10 +176,16 @@ def pose_protocol(
     for name in sequences:
         parts = named_recordings(root, name)
         first, last = parts[0], parts[-1]
-        shown = str(FrameRange(first.name, first.start, last.start + len(last))) if "[" in name else first.name
+        shown = (
+            str(FrameRange(first.name, first.start, last.start + len(last)))
+            if "[" in name
+            else first.name
+        )
         leak = refuse_leak(networks, [part.frames_name for part in parts], allow_leak)
         if length != 5:
-            raise DataError(f"the snippet protocol needs networks with 4 sources; these have {networks.sources}")
+            raise DataError(
+                f"the snippet protocol needs networks with 4 sources; these have {networks.sources}"
+            )
         snippets, predicted = [], defaultdict(list)
         for part in parts:
             T_world_camera = part.true_poses(fidelity)
@@ -177,7 +208,9 @@ def pose_protocol(
         for method, snippet_poses in predicted.items():
             errors = asdict(snippet_errors(np.stack(snippet_poses), true, fidelity=fidelity))
             count = errors.pop("count")
-            rows.append({"method": method, "recording": shown, **errors, "snippets": count, "leak": leak})
+            rows.append(
+                {"method": method, "recording": shown, **errors, "snippets": count, "leak": leak}
+            )
     return rows
 
 
@@ -194,33 +227,55 @@ def named_recordings(root: Path, name: str) -> list[Recording]:
             found.setdefault(known, []).append(each)
     span = FrameRange(name, 0, EVERYTHING) if name in found else FrameRange.parse(name)
     if span.recording not in found:
-        raise DataError(f"no sequence {span.recording} in {root}: found {', '.join(sorted(found)) or 'none'}")
+        raise DataError(
+            f"no sequence {span.recording} in {root}: found {', '.join(sorted(found)) or 'none'}"
+        )
     camera = found[span.recording][0].images[0].parent
     wholes = [whole for whole in found[span.recording] if whole.images[0].parent == camera]
     parts = [whole.within(span.start, span.stop) for whole in wholes]
     chosen = [part for part in parts if part is not None]
     if not chosen:
-        raise DataError(f"{name} names no frame of a recording: found {', '.join(w.frames_name for w in wholes)}")
+        raise DataError(
+            f"{name} names no frame of a recording: found {', '.join(w.frames_name for w in wholes)}"
+        )
     return chosen
 
 
-def _windows(recording: Recording, networks: DepthPosePredictor) -> Iterator[list[NDArray[np.float32]]]:
+def _windows(
+    recording: Recording, networks: DepthPosePredictor
+) -> Iterator[list[NDArray[np.float32]]]:
     """The prepared images of each snippet; no more of them are held than one has."""
     images: deque[NDArray[np.float32]] = deque(maxlen=networks.sources + 1)
     for index in range(len(recording)):
-        images.append(networks.prepare(recording.image(index, recording.camera.height, recording.camera.width)))
+        images.append(
+            networks.prepare(
+                recording.image(index, recording.camera.height, recording.camera.width)
+            )
+        )
         if len(images) == images.maxlen:
             yield list(images)
 
 
-def _depth_row(method: str, streets: list[list[DepthErrors]], before: list[list[DepthErrors]] | None) -> dict[str, Any]:
+def _depth_row(
+    method: str, streets: list[list[DepthErrors]], before: list[list[DepthErrors]] | None
+) -> dict[str, Any]:
     """Means over streets of the means over their frames, and their ratio to those of other networks ``before``."""
     means = [mean_errors(errors) for errors in streets]
     abs_rel = [each.abs_rel for each in means]
-    row: dict[str, Any] = {"method": method, **asdict(mean_errors(means)), "abs_rel_se": standard_error(abs_rel)}
+    row: dict[str, Any] = {
+        "method": method,
+        **asdict(mean_errors(means)),
+        "abs_rel_se": standard_error(abs_rel),
+    }
     if before is not None:
-        row["ratio"], row["ratio_se"] = mean_ratio(abs_rel, [mean_errors(errors).abs_rel for errors in before])
-    row |= {f"{key}_reason": "one street" for key in ("abs_rel_se", "ratio_se") if key in row and row[key] is None}
+        row["ratio"], row["ratio_se"] = mean_ratio(
+            abs_rel, [mean_errors(errors).abs_rel for errors in before]
+        )
+    row |= {
+        f"{key}_reason": "one street"
+        for key in ("abs_rel_se", "ratio_se")
+        if key in row and row[key] is None
+    }
     scales = np.array([each.scale for errors in streets for each in errors])
     row["scale_spread"] = float(scales.std() / scales.mean())
     return row | {"images": len(scales), "streets": len(streets)}
@@ -274,16 +329,23 @@ def many_view_protocol(
                 narrow = (low > 0) & (high < LARGEST_RATIO * low)
                 truth = np.zeros_like(low)  # where the bounds are too far apart
                 truth[narrow] = 1 / np.sqrt(low[narrow] * high[narrow])
-                error = depth_errors(networks.depth(recording.image(target, *truth.shape)), truth, CAP_HEIGHTS)
+                error = depth_errors(
+                    networks.depth(recording.image(target, *truth.shape)), truth, CAP_HEIGHTS
+                )
                 if error is not None:
                     errors.append(error)
                     known.append(float(np.mean((truth > 0) & (truth < CAP_HEIGHTS))))
             if not errors:
-                raise DataError(f"no depth could be measured in {recording.frames_name}: the camera has to travel")
+                raise DataError(
+                    f"no depth could be measured in {recording.frames_name}: the camera has to travel"
+                )
             mean, scales = mean_errors(errors), np.array([each.scale for each in errors])
             row: dict[str, Any] = {"method": "networks", "recording": recording.frames_name}
             row |= {key: getattr(mean, key) for key in _RATIOS}
-            row |= {"scale_spread": float(scales.std() / scales.mean()), "known": float(np.mean(known))}
+            row |= {
+                "scale_spread": float(scales.std() / scales.mean()),
+                "known": float(np.mean(known)),
+            }
             rows.append(row | {"images": len(errors), "leak": leak})
     return rows
 
@@ -349,7 +411,9 @@ def _of_pairs(root: Path) -> list[Street]:
 def _pair(image_file: Path, truth_file: Path) -> tuple[Image, Depth]:
     image, truth = read_image(image_file), read_depth_map(truth_file).astype(np.float32)
     if image.shape[:2] != truth.shape:
-        raise DataError(f"{truth_file} has size {truth.shape[::-1]}, and its image {image.shape[1::-1]}: give one size")
+        raise DataError(
+            f"{truth_file} has size {truth.shape[::-1]}, and its image {image.shape[1::-1]}: give one size"
+        )
     return image, truth
 
 
@@ -357,12 +421,18 @@ def _of_drives(root: Path) -> list[Street]:
     """KITTI raw drives by their scans, in the crop of Garg et al."""
     streets = []
     for drive, folder in find_drives(root).items():
-        scans = sorted(int(path.stem) for path in (folder / "velodyne_points" / "data").glob("*.bin"))
+        scans = sorted(
+            int(path.stem) for path in (folder / "velodyne_points" / "data").glob("*.bin")
+        )
         base = folder.absolute().parents[1]
         frames = [RawFrame(base, drive, index) for index in scans[::EVERY]]
         if frames:
             seen = [frame.name for frame in frames]
-            streets.append(Street(f"kitti_raw/{drive}", seen, [partial(_scan, frame) for frame in frames], "garg"))
+            streets.append(
+                Street(
+                    f"kitti_raw/{drive}", seen, [partial(_scan, frame) for frame in frames], "garg"
+                )
+            )
     return streets
 
 
@@ -374,11 +444,17 @@ def _scan(frame: RawFrame) -> tuple[Image, Depth]:
 def _of_recordings(root: Path) -> list[Street]:
     """Recordings with depth maps; the parts of one between gaps are one street."""
     recordings = [recording for recording in discover(root) if any(recording.depth or ())]
-    indices = [np.flatnonzero([file is not None for file in r.depth or ()])[::EVERY] for r in recordings]
-    frames = [(recording, int(index)) for recording, those in zip(recordings, indices) for index in those]
+    indices = [
+        np.flatnonzero([file is not None for file in r.depth or ()])[::EVERY] for r in recordings
+    ]
+    frames = [
+        (recording, int(index)) for recording, those in zip(recordings, indices) for index in those
+    ]
     truths = [_truth(recording, index) for recording, index in frames]
     if len({truth.shape for truth in truths}) > 1:
-        raise DataError(f"depth maps of different sizes in {root}: evaluate recordings of one size at a time")
+        raise DataError(
+            f"depth maps of different sizes in {root}: evaluate recordings of one size at a time"
+        )
     streets: dict[str, Street] = {}
     typical = _median_map(truths) if truths else None
     for recording in recordings:

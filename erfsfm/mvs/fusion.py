@@ -48,25 +48,38 @@ class DepthFusion:
         try:
             self._session: InferenceSession = open_session(read_bytes(path, _MOST_BYTES), _THREADS)
         except OSError as error:
-            raise CheckpointError(f"{path} cannot be read; give an output folder of erfsfm train-fusion") from error
+            raise CheckpointError(
+                f"{path} cannot be read; give an output folder of erfsfm train-fusion"
+            ) from error
         except Exception as error:  # ONNX Runtime raises classes of its own
             raise CheckpointError(f"{path} is damaged, or no ONNX file: train it again") from error
         inputs = self._session.get_inputs()
         if [i.name for i in inputs] != ["evidence"] or inputs[0].shape[1] != CHANNELS:
-            raise CheckpointError(f"{path} is no network of this version of erfsfm train-fusion: train it again")
+            raise CheckpointError(
+                f"{path} is no network of this version of erfsfm train-fusion: train it again"
+            )
 
     def decide(self, measurement: Measurement) -> RefinedDepth:
         """Between learned and measured depth at each pixel; the network finds by itself what moves."""
         depth, channels = measurement.depth, evidence(measurement)
         h, w = channels.shape[1:]
         padded = np.pad(channels, ((0, 0), (0, -h % STEP), (0, -w % STEP)), mode="edge")
-        odd = (0, depth.shape[0] - 2 * h, 0, depth.shape[1] - 2 * w)  # where a size is odd its last row comes again
+        odd = (
+            0,
+            depth.shape[0] - 2 * h,
+            0,
+            depth.shape[1] - 2 * w,
+        )  # where a size is odd its last row comes again
         change, log_sigma = (
             cv2.copyMakeBorder(values[0, : 2 * h, : 2 * w], *odd, cv2.BORDER_REPLICATE)
             for values in self._session.run(["change", "log_sigma"], {"evidence": padded[None]})
         )
-        sigma = np.hypot(np.minimum(np.exp(log_sigma), np.float32(_MOST_SIGMA)), np.float32(SIGMA_FLOOR))
-        return RefinedDepth((depth * np.exp(-change)).astype(np.float32), sigma, measurement.measured)
+        sigma = np.hypot(
+            np.minimum(np.exp(log_sigma), np.float32(_MOST_SIGMA)), np.float32(SIGMA_FLOOR)
+        )
+        return RefinedDepth(
+            (depth * np.exp(-change)).astype(np.float32), sigma, measurement.measured
+        )
 
 
 def evidence(measurement: Measurement) -> Array:
@@ -85,7 +98,9 @@ def evidence(measurement: Measurement) -> Array:
         y * np.exp(-nearness - measurement.change),  # height under the camera over the median depth
     )
     half = _of_costs(measurement.costs, measurement.coarse)
-    return np.concatenate([np.clip([_quartered(part, h, w) for part in full], -_MOST, _MOST).reshape(-1, h, w), half])
+    return np.concatenate(
+        [np.clip([_quartered(part, h, w) for part in full], -_MOST, _MOST).reshape(-1, h, w), half]
+    )
 
 
 def _of_costs(costs: Costs, coarse: Array) -> Array:
@@ -94,8 +109,12 @@ def _of_costs(costs: Costs, coarse: Array) -> Array:
     apart = np.abs(np.arange(len(costs), dtype=np.int8)[:, None, None] - best) > _APART
     others = np.where(apart, costs, np.int16(np.iinfo(np.int16).max))
     second = others.argmin(axis=0)
-    least = np.stack([costs.min(axis=0), costs[_GUESS], np.take_along_axis(others, second[None], axis=0)[0]])
-    return np.concatenate([[lowest(costs)], least / np.float32(UNIT), [CHANGES[second], coarse]]).astype(np.float32)
+    least = np.stack(
+        [costs.min(axis=0), costs[_GUESS], np.take_along_axis(others, second[None], axis=0)[0]]
+    )
+    return np.concatenate(
+        [[lowest(costs)], least / np.float32(UNIT), [CHANGES[second], coarse]]
+    ).astype(np.float32)
 
 
 def _quartered(part: Array, h: int, w: int) -> Array:

@@ -84,7 +84,9 @@ def measure(
     inverse = (1 / depth).astype(np.float32)
     small = np.asarray(cv2.resize(inverse, (w, h), interpolation=cv2.INTER_AREA), np.float32)
     pairs = list(zip(neighbours, T_neighbour_target))
-    costs = sweep(target.coarse, [(other.coarse, Projection(halved(K), T, h, w)) for other, T in pairs], small)
+    costs = sweep(
+        target.coarse, [(other.coarse, Projection(halved(K), T, h, w)) for other, T in pairs], small
+    )
     coarse = lowest(smoothed(costs, target.coarse_grey))
     change = _enlarged(np.asarray(cv2.medianBlur(coarse, 5), np.float32), target)
     views = [(other, Projection(K, T, height, width)) for other, T in pairs]
@@ -147,7 +149,9 @@ def _gauss_newton(
 
 
 # changes of the logarithm of inverse depth, denser near the guess; negative is farther
-CHANGES: Array = np.array([-2.4, -1.6, -1.0, -0.7, *(np.arange(-5, 7) / 10), 0.8, 1.0, 1.25], dtype=np.float32)
+CHANGES: Array = np.array(
+    [-2.4, -1.6, -1.0, -0.7, *(np.arange(-5, 7) / 10), 0.8, 1.0, 1.25], dtype=np.float32
+)
 LARGEST_DIFFERENCE = 0.8  # of normalised grey levels: more is an occlusion
 WEIGHT_UNSEEN = 0.5  # of the cost of the guess, in views
 COST_OF_CHANGE = 0.1  # a unit of log inverse depth
@@ -160,7 +164,9 @@ LARGE_STEP = 1.0  # for more, where the image is smooth
 EDGE_GREY_LEVELS = 8.0  # image step across which a large step costs 1/e of that
 
 
-def sweep(levels: Array, neighbours: Sequence[tuple[Array, Projection]], inverse_depth: Array) -> Costs:
+def sweep(
+    levels: Array, neighbours: Sequence[tuple[Array, Projection]], inverse_depth: Array
+) -> Costs:
     """Cost ``(C, h, w)`` of each change of the inverse depth.
 
     Args:
@@ -193,14 +199,19 @@ def _differences(
         total += cv2.min(difference, LARGEST_DIFFERENCE)
     window = (WINDOW_PX, WINDOW_PX)
     missing = cv2.boxFilter(unseen, cv2.CV_32F, window)
-    return cv2.boxFilter(total, -1, window) - np.float32(LARGEST_DIFFERENCE) * missing, len(neighbours) - missing
+    return cv2.boxFilter(total, -1, window) - np.float32(LARGEST_DIFFERENCE) * missing, len(
+        neighbours
+    ) - missing
 
 
 def warped(image: Array, u: Array, v: Array) -> Array:
     """An image at other pixels; very large outside of it."""
     outside = (_OUTSIDE,) * 4
     return np.asarray(
-        cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=outside), np.float32
+        cv2.remap(
+            image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=outside
+        ),
+        np.float32,
     )
 
 
@@ -233,7 +244,9 @@ def smoothed(costs: Costs, grey: Array) -> Costs:
 def _penalties(grey: Array) -> Costs:
     """Of a large step between each row and the one before, ``(h - 1, w)``."""
     steps = np.abs(np.diff(grey, axis=0))
-    return np.asarray(UNIT * (SMALL_STEP + LARGE_STEP * np.exp(-steps / EDGE_GREY_LEVELS)), np.int16)
+    return np.asarray(
+        UNIT * (SMALL_STEP + LARGE_STEP * np.exp(-steps / EDGE_GREY_LEVELS)), np.int16
+    )
 
 
 def _both_ways(volume: Costs, penalties: Costs) -> Costs:

@@ -36,19 +36,25 @@ class Appearance:
     def of(cls, grey: Grey) -> Appearance:
         """Normalise a grey image ``(H, W)``."""
         height, width = grey.shape
-        half = cv2.resize(grey, (max(width // 2, 1), max(height // 2, 1)), interpolation=cv2.INTER_AREA)
+        half = cv2.resize(
+            grey, (max(width // 2, 1), max(height // 2, 1)), interpolation=cv2.INTER_AREA
+        )
         full, small = grey.astype(np.float32), np.asarray(half, np.float32)
         levels = normalised(full)
         along_x = cv2.Sobel(levels, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
         along_y = cv2.Sobel(levels, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
-        return cls(full, levels, (np.asarray(along_x), np.asarray(along_y)), normalised(small), small)
+        return cls(
+            full, levels, (np.asarray(along_x), np.asarray(along_y)), normalised(small), small
+        )
 
 
 def normalised(grey: Array) -> Array:
     """Grey levels ``(H, W)`` minus their local mean, over their local standard deviation."""
     mean = cv2.GaussianBlur(grey, (0, 0), NEIGHBOURHOOD_PX)
     variance = cv2.GaussianBlur(grey * grey, (0, 0), NEIGHBOURHOOD_PX) - mean * mean
-    return np.asarray((grey - mean) / (np.sqrt(np.maximum(variance, 0)) + np.float32(CONTRAST_FLOOR)), np.float32)
+    return np.asarray(
+        (grey - mean) / (np.sqrt(np.maximum(variance, 0)) + np.float32(CONTRAST_FLOOR)), np.float32
+    )
 
 
 BASELINES = (0.07, 0.2)  # wanted distances over the median depth
@@ -59,7 +65,9 @@ _MAX_FRAMES_APART = 40
 LEAST_Z = 1e-3
 
 
-def neighbours(T_world_camera: NDArray[np.float64], target: int, wanted: Iterable[float]) -> list[int]:
+def neighbours(
+    T_world_camera: NDArray[np.float64], target: int, wanted: Iterable[float]
+) -> list[int]:
     """The best view of each wanted distance, each once, in the order of these; none where no view is usable.
 
     Args:
@@ -84,7 +92,10 @@ def neighbours(T_world_camera: NDArray[np.float64], target: int, wanted: Iterabl
 
 
 def neighbours_around(
-    T_world_camera: NDArray[np.float64], target: int, median_depth: float, frames: Sequence[int] | NDArray[np.int64]
+    T_world_camera: NDArray[np.float64],
+    target: int,
+    median_depth: float,
+    frames: Sequence[int] | NDArray[np.int64],
 ) -> list[int]:
     """The views that refine the depth of one, in time order: the best at each distance of ``BASELINES``, three at most.
 
@@ -106,16 +117,25 @@ class Projection:
     """``K (R p + d t)`` for all pixels p of an image, with the rotated rays computed once."""
 
     def __init__(
-        self, K: NDArray[np.floating], T_neighbour_target: NDArray[np.floating], height: int, width: int
+        self,
+        K: NDArray[np.floating],
+        T_neighbour_target: NDArray[np.floating],
+        height: int,
+        width: int,
     ) -> None:
         H = (K @ T_neighbour_target[:3, :3] @ np.linalg.inv(K)).astype(np.float32)
         u, v = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
-        self._rotated = [H[row, 0] * u + H[row, 1] * v + H[row, 2] for row in range(3)]  # (H, W) each
+        self._rotated = [
+            H[row, 0] * u + H[row, 1] * v + H[row, 2] for row in range(3)
+        ]  # (H, W) each
         self._moved = (K @ T_neighbour_target[:3, 3]).astype(np.float32)
 
     def pixels(self, inverse_depth: Array) -> tuple[Array, Array, Array]:
         """Columns, rows and z over the depth, ``(H, W)`` each."""
-        x, y, z = (cv2.scaleAdd(inverse_depth, float(m), r) for r, m in zip(self._rotated, self._moved, strict=True))
+        x, y, z = (
+            cv2.scaleAdd(inverse_depth, float(m), r)
+            for r, m in zip(self._rotated, self._moved, strict=True)
+        )
         z = cv2.max(z, LEAST_Z)
         return x / z, y / z, z
 

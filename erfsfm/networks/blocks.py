@@ -43,9 +43,13 @@ class ConvBlock(nn.Sequential):
         padding = (layer.kernel - 1) // 2 * (1 if fidelity == "paper" else layer.dilation)
         convolution: nn.Module
         if layer.deformable:
-            convolution = DeformableConv2d(in_channels, out_channels, layer.kernel, layer.stride, padding)
+            convolution = DeformableConv2d(
+                in_channels, out_channels, layer.kernel, layer.stride, padding
+            )
         else:
-            convolution = nn.Conv2d(in_channels, out_channels, layer.kernel, layer.stride, padding, layer.dilation)
+            convolution = nn.Conv2d(
+                in_channels, out_channels, layer.kernel, layer.stride, padding, layer.dilation
+            )
         super().__init__(convolution, *_activation(out_channels, normalisation))
         self.layer = layer
         self.padding = padding
@@ -58,7 +62,11 @@ class UpBlock(nn.Sequential):
     """
 
     def __init__(
-        self, in_channels: int, out_channels: int, kernel: Literal[3, 4], normalisation: Normalisation = "none"
+        self,
+        in_channels: int,
+        out_channels: int,
+        kernel: Literal[3, 4],
+        normalisation: Normalisation = "none",
     ) -> None:
         convolution = nn.ConvTranspose2d(
             in_channels, out_channels, kernel, stride=2, padding=1, output_padding=4 - kernel

@@ -63,7 +63,9 @@ class DeformableConv2d(nn.Module):
     2 * sigmoid (with bias), and the kernel itself (no bias).
     """
 
-    def __init__(self, in_channels: int, out_channels: int, kernel: int, stride: int, padding: int) -> None:
+    def __init__(
+        self, in_channels: int, out_channels: int, kernel: int, stride: int, padding: int
+    ) -> None:
         super().__init__()
         self.stride = stride
         self.padding = padding
@@ -125,12 +127,18 @@ def _check_shapes(
 ) -> tuple[int, int]:
     """Check the shapes and return the size of the output."""
     if input.dim() != 4 or weight.dim() != 4:
-        raise ValueError(f"input and weight must be 4-d; got {tuple(input.shape)} and {tuple(weight.shape)}")
+        raise ValueError(
+            f"input and weight must be 4-d; got {tuple(input.shape)} and {tuple(weight.shape)}"
+        )
     batch, channels = input.shape[:2]
     if channels % weight.shape[1] or weight.shape[0] % (channels // weight.shape[1]):
-        raise ValueError(f"weight must have shape (C_out, {channels} / groups, k_h, k_w); got {tuple(weight.shape)}")
+        raise ValueError(
+            f"weight must have shape (C_out, {channels} / groups, k_h, k_w); got {tuple(weight.shape)}"
+        )
     out_h, out_w = (
-        (input.shape[2 + i] + 2 * padding[i] - dilation[i] * (weight.shape[2 + i] - 1) - 1) // stride[i] + 1
+        (input.shape[2 + i] + 2 * padding[i] - dilation[i] * (weight.shape[2 + i] - 1) - 1)
+        // stride[i]
+        + 1
         for i in range(2)
     )
     if min(out_h, out_w) < 1:
@@ -148,9 +156,13 @@ def _check_shapes(
     return out_h, out_w
 
 
-def _resting_places(out: int, kernel: int, stride: int, padding: int, dilation: int, like: Tensor) -> Tensor:
+def _resting_places(
+    out: int, kernel: int, stride: int, padding: int, dilation: int, like: Tensor
+) -> Tensor:
     """Positions of the taps of each output along one axis at zero offset, in pixels, ``(out, kernel)``."""
-    dtype = torch.promote_types(like.dtype, torch.float32)  # half precision cannot represent pixel indices
+    dtype = torch.promote_types(
+        like.dtype, torch.float32
+    )  # half precision cannot represent pixel indices
     first = torch.arange(out, device=like.device, dtype=dtype) * stride - padding
     return first[:, None] + torch.arange(kernel, device=like.device, dtype=dtype) * dilation
 
@@ -172,7 +184,12 @@ def _sampling_grid(offset: Tensor, rows: Tensor, columns: Tensor, size: tuple[in
 
 
 def _sample(
-    input: Tensor, offset: Tensor, weight: Tensor, mask: Tensor | None, rows: Tensor, columns: Tensor
+    input: Tensor,
+    offset: Tensor,
+    weight: Tensor,
+    mask: Tensor | None,
+    rows: Tensor,
+    columns: Tensor,
 ) -> Tensor:
     """The convolution without its bias, ``(B, C_out, H_out, W_out)``; arguments as of `deform_conv2d`.
 
@@ -188,7 +205,9 @@ def _sample(
     grid = _sampling_grid(offset, rows, columns, (input.shape[2], input.shape[3]))
     maps = input.reshape(batch * groups, channels // groups, *input.shape[2:]).to(grid.dtype)
     factors = grid.new_ones(()) if mask is None else mask.to(grid.dtype)
-    factors = factors.expand(batch, groups * taps, out_h, out_w).reshape(batch * groups, 1, taps, -1)
+    factors = factors.expand(batch, groups * taps, out_h, out_w).reshape(
+        batch * groups, 1, taps, -1
+    )
     images, places = batch, out_h * out_w
     if input.device.type == "cpu":
         places = max(1, min(places, _CPU_CHUNK // (channels * taps)))
@@ -222,8 +241,12 @@ def _sample_and_combine(
     inside = weight[0].numel()
     weight_groups = channels // weight.shape[1]
     pieces = []
-    for positions, scale in zip(torch.split(grid, places, dim=2), torch.split(factors, places, dim=3)):
-        sampled = F.grid_sample(maps, positions, mode="bilinear", padding_mode="zeros", align_corners=False)
+    for positions, scale in zip(
+        torch.split(grid, places, dim=2), torch.split(factors, places, dim=3)
+    ):
+        sampled = F.grid_sample(
+            maps, positions, mode="bilinear", padding_mode="zeros", align_corners=False
+        )
         columns = (sampled * scale).to(weight.dtype)
         columns = columns.view(-1, weight_groups, inside, columns.shape[-1])
         if weight_groups == 1:

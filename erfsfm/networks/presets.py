@@ -66,7 +66,9 @@ def build(
         raise ConfigError(f"unknown network '{name}'{hint}; known: {', '.join(PRESETS)}")
     preset = PRESETS[name]
     if fidelity not in get_args(Fidelity):
-        raise ConfigError(f"fidelity must be one of {', '.join(get_args(Fidelity))}; got '{fidelity}'")
+        raise ConfigError(
+            f"fidelity must be one of {', '.join(get_args(Fidelity))}; got '{fidelity}'"
+        )
     if not 0 < width <= 8:
         raise ConfigError(f"width must be above 0 and at most 8; got {width}")
     network: Network
@@ -83,7 +85,9 @@ def build(
     return network
 
 
-def describe(fidelity: Fidelity = "default", width: float = 1.0, sources: int = 4) -> list[dict[str, Any]]:
+def describe(
+    fidelity: Fidelity = "default", width: float = 1.0, sources: int = 4
+) -> list[dict[str, Any]]:
     """Every preset of a fidelity in numbers; only shapes are computed.
 
     Returns:
@@ -99,7 +103,11 @@ def describe(fidelity: Fidelity = "default", width: float = 1.0, sources: int = 
             continue
         with torch.device("meta"):
             network = build(name, fidelity, width, sources)
-        summary = {"name": name, "kind": preset.kind, "parameters": sum(p.numel() for p in network.parameters())}
+        summary = {
+            "name": name,
+            "kind": preset.kind,
+            "parameters": sum(p.numel() for p in network.parameters()),
+        }
         try:
             summary |= {"multiply_adds": multiply_adds(network), "multiply_adds_reason": None}
         except ConfigError as error:

@@ -67,7 +67,9 @@ def theoretical(network: Network, offsets_px: float = 0.0) -> int:
     return field_after(layers) + 2 * math.ceil(offsets_px) * moving
 
 
-def theoretical_corner(network: Network, pixel: tuple[int, int], offsets_px: float = 0.0) -> tuple[int, int]:
+def theoretical_corner(
+    network: Network, pixel: tuple[int, int], offsets_px: float = 0.0
+) -> tuple[int, int]:
     """Image row and column of the top-left corner of a field of `theoretical` side; outside the image too.
 
     Args:
@@ -90,7 +92,9 @@ def field_after(layers: Sequence[Layer]) -> int:
 
     r += (k - 1) d j;  j *= s        with the jump j of the layer's input in pixels
     """
-    return 1 + sum((layer.kernel - 1) * layer.dilation * jump for layer, jump in zip(layers, _jumps(layers)))
+    return 1 + sum(
+        (layer.kernel - 1) * layer.dilation * jump for layer, jump in zip(layers, _jumps(layers))
+    )
 
 
 def _jumps(layers: Sequence[Layer]) -> list[int]:
@@ -99,7 +103,10 @@ def _jumps(layers: Sequence[Layer]) -> list[int]:
 
 
 def measured(
-    network: Network, size: tuple[int, int] = (128, 416), pixel: tuple[int, int] | None = None, offsets_px: float = 0.0
+    network: Network,
+    size: tuple[int, int] = (128, 416),
+    pixel: tuple[int, int] | None = None,
+    offsets_px: float = 0.0,
 ) -> MeasuredField:
     """Bounding box and coverage by input gradients, with constant positive weights and a white image.
 
@@ -117,11 +124,15 @@ def share_read(network: Network, size: tuple[int, int], offsets_px: float = 0.0)
     """Fraction of the image's pixels in the field of any output of the last encoder layer; arguments as `measured`."""
     encoder, image = _evenly_weighted(network, size, offsets_px)
     image.requires_grad_()
-    (gradient,) = torch.autograd.grad(encoder(image)[-1].sum(), image)  # of positive terms: none cancel
+    (gradient,) = torch.autograd.grad(
+        encoder(image)[-1].sum(), image
+    )  # of positive terms: none cancel
     return float((gradient > 0).any(dim=1).double().mean())
 
 
-def _evenly_weighted(network: Network, size: tuple[int, int], offsets_px: float) -> tuple[Encoder, Tensor]:
+def _evenly_weighted(
+    network: Network, size: tuple[int, int], offsets_px: float
+) -> tuple[Encoder, Tensor]:
     """A copy of the encoder with constant positive weights, and a white image for it.
 
     Weights are one over the fan-in, so that no activation overflows.
@@ -141,7 +152,9 @@ def _evenly_weighted(network: Network, size: tuple[int, int], offsets_px: float)
         module.reset_offsets()
         side = module.kernel.kernel_size[0]
         outwards = torch.sign(torch.arange(side) - (side - 1) / 2) * offsets_px
-        taps = torch.stack(torch.meshgrid(outwards, outwards, indexing="ij"), dim=-1)  # (k, k, [dy, dx])
+        taps = torch.stack(
+            torch.meshgrid(outwards, outwards, indexing="ij"), dim=-1
+        )  # (k, k, [dy, dx])
         assert module.offset.bias is not None
         with torch.no_grad():
             module.offset.bias.copy_(taps.flatten())

@@ -32,13 +32,17 @@ class TorchNetwork:
         return np.asarray(output.float().cpu().numpy())
 
 
-def tensors(inputs: Sequence[Array | list[Array]], device: str = "cpu") -> list[Tensor | list[Tensor]]:
+def tensors(
+    inputs: Sequence[Array | list[Array]], device: str = "cpu"
+) -> list[Tensor | list[Tensor]]:
     """The same structure of tensors."""
 
     def moved(array: Array) -> Tensor:
         return torch.from_numpy(array).to(device)
 
-    return [list(map(moved, given)) if isinstance(given, list) else moved(given) for given in inputs]
+    return [
+        list(map(moved, given)) if isinstance(given, list) else moved(given) for given in inputs
+    ]
 
 
 @torch.inference_mode()
@@ -71,7 +75,9 @@ def exported(
             file,  # type: ignore[arg-type]  # in memory: no disk that may be full
             input_names=inputs,
             output_names=outputs,
-            dynamic_axes={name: {axis: f"axis{axis}" for axis in free} for name in inputs or ()} if free else None,
+            dynamic_axes={name: {axis: f"axis{axis}" for axis in free} for name in inputs or ()}
+            if free
+            else None,
             opset_version=OPSET,
             dynamo=False,  # the newer exporter needs onnxscript, and writes the same graph
         )

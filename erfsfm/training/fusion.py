@@ -37,12 +37,20 @@ _LEARNING_RATE, _LEAST_RATE = 2e-3, 0.01
 _WARM_UP = 100
 _WEIGHT_DECAY = 1e-3
 _HUBER = 0.02  # of log depth
-_RELATIVE, _LIKELIHOOD, _EDGES, _SKY = 0.5, 0.1, 0.3, 0.2  # weights of losses beside the error of log depth
+_RELATIVE, _LIKELIHOOD, _EDGES, _SKY = (
+    0.5,
+    0.1,
+    0.3,
+    0.2,
+)  # weights of losses beside the error of log depth
 _EDGE_STEPS = (1, 2, 4)  # pixels
 _LARGEST_ERROR = 1.5  # of log depth, for the relative error
 _CHUNK = 100  # samples of one task and one seed
 _VALIDATION_SEED = 10**6
-_COVERAGE, _SIGMAS = 0.9, 1.645  # the sigma is scaled so that this share of the errors is within as many of it
+_COVERAGE, _SIGMAS = (
+    0.9,
+    1.645,
+)  # the sigma is scaled so that this share of the errors is within as many of it
 
 
 def train_fusion(
@@ -75,7 +83,9 @@ def train_fusion(
     assert STEP == 2**LEVELS, "evidence is padded for another network"
     torch.manual_seed(seed)
     if (output / FILE).exists() and not (output / RECORD).exists():
-        raise TrainingError(f"{output / FILE} is not of train-fusion and would be replaced: choose another --output")
+        raise TrainingError(
+            f"{output / FILE} is not of train-fusion and would be replaced: choose another --output"
+        )
     output.mkdir(parents=True, exist_ok=True)
     data = _drawn(datasets, weights, samples, seed, progress)
     held_out = _drawn(validation, weights, max(samples // 20, _CHUNK), _VALIDATION_SEED, progress)
@@ -83,14 +93,25 @@ def train_fusion(
     _optimise(net, data, steps, seed, progress)
     net.eval()
     metrics = _fit_sigma(net, held_out)
-    graph = exported(net, [torch.zeros(1, CHANNELS, STEP, STEP)], ["evidence"], ["change", "log_sigma"], (2, 3))
+    graph = exported(
+        net, [torch.zeros(1, CHANNELS, STEP, STEP)], ["evidence"], ["change", "log_sigma"], (2, 3)
+    )
     write_atomically(output / FILE, graph)
-    record = {"command": command, "weights": weights, "samples": samples, "steps": steps, "seed": seed, **metrics}
+    record = {
+        "command": command,
+        "weights": weights,
+        "samples": samples,
+        "steps": steps,
+        "seed": seed,
+        **metrics,
+    }
     write_atomically(output / RECORD, json.dumps(record, indent=2) + "\n")
     return metrics
 
 
-def _drawn(roots: Sequence[Path], weights: str, count: int, seed: int, progress: Progress) -> list[Sample]:
+def _drawn(
+    roots: Sequence[Path], weights: str, count: int, seed: int, progress: Progress
+) -> list[Sample]:
     """Samples of worlds, by as many processes as there are cores; the same for any number of them."""
     chunks = [seed * 10**4 + n for n in range(math.ceil(count / _CHUNK))]
     drawn: list[Sample] = []
@@ -103,16 +124,22 @@ def _drawn(roots: Sequence[Path], weights: str, count: int, seed: int, progress:
 
 def _chunk(roots: Sequence[Path], weights: str, seed: int) -> list[Sample]:
     recordings = [recording for root in roots for recording in discover(root)]
-    source = FusionSamples(recordings, DepthPosePredictor.from_weights(weights, runtime="onnx"), seed)
+    source = FusionSamples(
+        recordings, DepthPosePredictor.from_weights(weights, runtime="onnx"), seed
+    )
     return [source.draw() for _ in range(_CHUNK)]
 
 
-def _optimise(net: FusionNet, data: Sequence[Sample], steps: int, seed: int, progress: Progress) -> None:
+def _optimise(
+    net: FusionNet, data: Sequence[Sample], steps: int, seed: int, progress: Progress
+) -> None:
     rng = np.random.default_rng(seed)
     optimiser = torch.optim.AdamW(net.parameters(), _LEARNING_RATE, weight_decay=_WEIGHT_DECAY)
 
     def rate(step: int) -> float:
-        return min(1, (step + 1) / _WARM_UP) * max(_LEAST_RATE, (1 + math.cos(math.pi * step / steps)) / 2)
+        return min(1, (step + 1) / _WARM_UP) * max(
+            _LEAST_RATE, (1 + math.cos(math.pi * step / steps)) / 2
+        )
 
     schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, rate)
     order: list[int] = []
@@ -120,14 +147,18 @@ def _optimise(net: FusionNet, data: Sequence[Sample], steps: int, seed: int, pro
     for step in range(steps):
         if len(order) < _BATCH:
             order = rng.permutation(len(data)).tolist()
-        evidence, wanted, is_known = _batch([data[order.pop()] for _ in range(min(_BATCH, len(order)))])
+        evidence, wanted, is_known = _batch(
+            [data[order.pop()] for _ in range(min(_BATCH, len(order)))]
+        )
         if rng.random() < 0.5:
             evidence, wanted, is_known = _mirrored(evidence), wanted.flip(-1), is_known.flip(-1)
         with torch.autocast("cpu", torch.bfloat16, enabled=in_bfloat16):
             change, log_sigma = net(evidence)
         loss = fusion_loss(change, log_sigma, wanted, is_known)
         if not torch.isfinite(loss):
-            raise TrainingError(f"the loss is not finite at step {step}: begin again with another --seed")
+            raise TrainingError(
+                f"the loss is not finite at step {step}: begin again with another --seed"
+            )
         optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(net.parameters(), 1.0)
@@ -154,15 +185,25 @@ def fusion_loss(change: Tensor, log_sigma: Tensor, wanted: Tensor, is_known: Ten
     likelihood = ((error.detach().abs() * torch.exp(-log_sigma) + log_sigma) * known).sum()
     edges = error.new_zeros(())
     for step in _EDGE_STEPS:
-        along = (error[:, :, step:] - error[:, :, :-step]).abs() * known[:, :, step:] * known[:, :, :-step]
+        along = (
+            (error[:, :, step:] - error[:, :, :-step]).abs()
+            * known[:, :, step:]
+            * known[:, :, :-step]
+        )
         across = (error[:, step:] - error[:, :-step]).abs() * known[:, step:] * known[:, :-step]
         edges = edges + along.mean() + across.mean()
     sky = ((change - wanted).clamp(min=0) * (1 - known)).mean()
-    return (huber + _RELATIVE * relative + _LIKELIHOOD * likelihood) / count + _EDGES * edges + _SKY * sky
+    return (
+        (huber + _RELATIVE * relative + _LIKELIHOOD * likelihood) / count
+        + _EDGES * edges
+        + _SKY * sky
+    )
 
 
 def _batch(samples: Sequence[Sample]) -> tuple[Tensor, Tensor, Tensor]:
-    evidence, wanted, is_known = (torch.from_numpy(np.stack(part)) for part in zip(*samples, strict=True))
+    evidence, wanted, is_known = (
+        torch.from_numpy(np.stack(part)) for part in zip(*samples, strict=True)
+    )
     return evidence.float().contiguous(memory_format=torch.channels_last), wanted.float(), is_known
 
 
@@ -171,7 +212,11 @@ def _mirrored(evidence: Tensor) -> Tensor:
     count, _, h, w = evidence.shape
     blocks = 4 * FULL_SIZE
     full = evidence[:, :blocks].reshape(count, -1, 2, 2, h, w).flip(3).reshape(count, blocks, h, w)
-    return torch.cat([full, evidence[:, blocks:]], 1).flip(-1).contiguous(memory_format=torch.channels_last)
+    return (
+        torch.cat([full, evidence[:, blocks:]], 1)
+        .flip(-1)
+        .contiguous(memory_format=torch.channels_last)
+    )
 
 
 @torch.inference_mode()
@@ -183,7 +228,11 @@ def _fit_sigma(net: FusionNet, data: Sequence[Sample]) -> dict[str, float]:
         evidence, wanted, is_known = _batch(data[first : first + _BATCH])
         change, log_sigma = net(evidence)
         measured = functional.pixel_shuffle(evidence[:, 4 * CHANGE : 4 * CHANGE + 4], 2)[:, 0]
-        for name, found in (("guess", torch.zeros_like(change)), ("measured", measured), ("fused", change)):
+        for name, found in (
+            ("guess", torch.zeros_like(change)),
+            ("measured", measured),
+            ("fused", change),
+        ):
             errors[name].append((torch.exp((wanted - found)[is_known]) - 1).abs())
         ratios.append(((wanted - change).abs() * torch.exp(-log_sigma))[is_known])
     every = torch.cat(ratios)[::7]
@@ -217,7 +266,9 @@ class FusionNet(nn.Module):
     def __init__(self, channels: int, measured: int) -> None:
         super().__init__()
         self._measured = measured
-        self.down = nn.ModuleList(nn.Sequential(*_layer(a, b), *_layer(b, b)) for a, b in pairwise((channels, *WIDTHS)))
+        self.down = nn.ModuleList(
+            nn.Sequential(*_layer(a, b), *_layer(b, b)) for a, b in pairwise((channels, *WIDTHS))
+        )
         self.narrow = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in pairwise(WIDTHS[::-1]))
         self.up = nn.ModuleList(nn.Sequential(*_layer(width, width)) for width in WIDTHS[-2::-1])
         self.head = nn.Conv2d(WIDTHS[0], 12, 3, padding=1)
@@ -233,17 +284,25 @@ class FusionNet(nn.Module):
             kept.append(block(functional.max_pool2d(kept[-1], 2)))
         decided = kept.pop()
         for narrow, block in zip(self.narrow, self.up, strict=True):
-            larger = functional.interpolate(narrow(decided), scale_factor=2, mode="bilinear", align_corners=False)
+            larger = functional.interpolate(
+                narrow(decided), scale_factor=2, mode="bilinear", align_corners=False
+            )
             decided = block(larger + kept.pop())
         trust, own, log_sigma = self.head(decided).float().split(4, 1)
         trust = torch.sigmoid(trust)
         measured = evidence[:, self._measured : self._measured + 4]
         change = trust * measured + (1 - trust) * _LARGEST_CHANGE * torch.tanh(own)
-        return functional.pixel_shuffle(change, 2)[:, 0], functional.pixel_shuffle(log_sigma, 2)[:, 0]
+        return functional.pixel_shuffle(change, 2)[:, 0], functional.pixel_shuffle(log_sigma, 2)[
+            :, 0
+        ]
 
 
 def _layer(inputs: int, outputs: int) -> list[nn.Module]:
-    return [nn.Conv2d(inputs, outputs, 3, padding=1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU()]
+    return [
+        nn.Conv2d(inputs, outputs, 3, padding=1, bias=False),
+        nn.BatchNorm2d(outputs),
+        nn.ReLU(),
+    ]
 
 
 WIDTH = 416
@@ -278,8 +337,14 @@ class Sample(NamedTuple):
 class FusionSamples:
     """Random frames of simulated drives, seen as a run sees its keyframes: poses, images and unit have errors."""
 
-    def __init__(self, recordings: Sequence[Recording], networks: DepthPosePredictor, seed: int) -> None:
-        posed = [(r, poses) for r in recordings if r.depth is not None and (poses := r.true_poses()) is not None]
+    def __init__(
+        self, recordings: Sequence[Recording], networks: DepthPosePredictor, seed: int
+    ) -> None:
+        posed = [
+            (r, poses)
+            for r in recordings
+            if r.depth is not None and (poses := r.true_poses()) is not None
+        ]
         if not posed:
             raise TrainingError(f"no drive has depth maps and poses: {_WANTED}")
         flat = [r for r, _ in posed if _height(r) < 2 * CROP[0]]
@@ -312,7 +377,9 @@ class FusionSamples:
         height = _height(recording)
         size = (WIDTH, height)
         truth = np.asarray(cv2.resize(truth, size, interpolation=cv2.INTER_NEAREST_EXACT))
-        baselines = np.multiply(_BASELINES, np.exp(rng.normal(0, _BASELINE_SPREAD, len(_BASELINES))))
+        baselines = np.multiply(
+            _BASELINES, np.exp(rng.normal(0, _BASELINE_SPREAD, len(_BASELINES)))
+        )
         chosen = neighbours(T_world_camera, index, baselines * np.median(truth[truth > 0]))
         chosen = [n for n in chosen if rng.random() > _LEFT_OUT]
         if not chosen:
@@ -331,7 +398,9 @@ class FusionSamples:
         channels = evidence(measure(target, guess, others, K, T_neighbour_target))
         is_known = truth > 0
         wanted, (h, w) = np.log(guess / np.where(is_known, truth, FARTHEST_M)), CROP
-        top, left = (int(rng.integers(have - need + 1)) for have, need in zip(channels.shape[1:], CROP))
+        top, left = (
+            int(rng.integers(have - need + 1)) for have, need in zip(channels.shape[1:], CROP)
+        )
         at = slice(2 * top, 2 * (top + h)), slice(2 * left, 2 * (left + w))
         part = channels[:, top : top + h, left : left + w]
         return Sample(part.astype(np.float16), wanted[at].astype(np.float16), is_known[at])
@@ -342,10 +411,14 @@ class FusionSamples:
         height, width = truth.shape
         depth = depth_at(self._networks.disparity(image), height, width)  # as a run has it
         known = truth > 0
-        depth = depth * np.float32(np.median(truth[known] / depth[known]) * np.exp(rng.normal(0, _SCALE_SPREAD)))
+        depth = depth * np.float32(
+            np.median(truth[known] / depth[known]) * np.exp(rng.normal(0, _SCALE_SPREAD))
+        )
         if rng.random() < 0.6:
             bend = rng.normal(0, rng.uniform(0.02, 0.2), (rng.integers(2, 6), rng.integers(3, 10)))
-            depth = depth * np.exp(cv2.resize(bend.astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC))
+            depth = depth * np.exp(
+                cv2.resize(bend.astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
+            )
         if rng.random() < 0.4:
             depth = 1 / cv2.GaussianBlur(1 / depth, (0, 0), rng.uniform(1, 4))
         return np.asarray(depth, np.float32)

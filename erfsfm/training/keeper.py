@@ -31,10 +31,14 @@ class Average(WeightAveraging):
     def __init__(self, decay: float, device: str) -> None:
         super().__init__(torch.device(device), multi_avg_fn=get_ema_multi_avg_fn(decay))
 
-    def on_validation_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+    def on_validation_epoch_end(
+        self, trainer: lightning.Trainer, module: lightning.LightningModule
+    ) -> None:
         """Leave the average in the module."""
 
-    def on_validation_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+    def on_validation_end(
+        self, trainer: lightning.Trainer, module: lightning.LightningModule
+    ) -> None:
         """Give the module its own weights back."""
         super().on_validation_epoch_end(trainer, module)
 
@@ -62,7 +66,9 @@ class WeightKeeper(Callback):
         device: str = "cpu",
     ) -> None:
         self._output = output
-        self.average = Average(training.average_decay, device) if training.average_decay > 0 else None
+        self.average = (
+            Average(training.average_decay, device) if training.average_decay > 0 else None
+        )
         self._seen = seen
         self._command = command
         self.validates = validates
@@ -70,23 +76,35 @@ class WeightKeeper(Callback):
         self._best = dict.fromkeys(self._measures({}), math.inf)
         for folder in self._best:
             if (folder / "model.yaml").is_file():
-                self._best[folder] = self._measures(read_record(folder / "model.yaml").metrics)[folder]
+                self._best[folder] = self._measures(read_record(folder / "model.yaml").metrics)[
+                    folder
+                ]
         self._saved_step = -1
 
     def on_train_batch_end(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self,
+        trainer: lightning.Trainer,
+        module: lightning.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
     ) -> None:
         """Ask for a stop after the last step: Lightning then validates once more."""
         if self.validates and trainer.global_step >= trainer.max_steps:
             trainer.should_stop = True
 
-    def on_validation_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+    def on_validation_end(
+        self, trainer: lightning.Trainer, module: lightning.LightningModule
+    ) -> None:
         """Write the validated weights."""
         assert isinstance(module, SelfSupervision)
         self.save(trainer, module)
 
     def on_exception(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule, exception: BaseException
+        self,
+        trainer: lightning.Trainer,
+        module: lightning.LightningModule,
+        exception: BaseException,
     ) -> None:
         """Keep the weights so far, if they are finite."""
         assert isinstance(module, SelfSupervision)
@@ -117,7 +135,9 @@ class WeightKeeper(Callback):
         model = self._model(module, step)
         save_model(self._output / "last", model)
         measured = self._measures(module.validation_metrics)
-        improved = {folder: value for folder, value in measured.items() if value < self._best[folder]}
+        improved = {
+            folder: value for folder, value in measured.items() if value < self._best[folder]
+        }
         folders = set(improved)
         if not self.validates or math.isinf(self._best[self._output]):
             folders.add(self._output)
@@ -189,25 +209,40 @@ class StepProgress(Callback):
         self._began: tuple[int, float] | None = None
         self._said = False
 
-    def on_train_batch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule, *_: Any) -> None:
+    def on_train_batch_end(
+        self, trainer: lightning.Trainer, module: lightning.LightningModule, *_: Any
+    ) -> None:
         """Tell of a step."""
         assert isinstance(module, SelfSupervision)
         if not trainer.is_global_zero:
             return
         step, now_s = trainer.global_step, time.monotonic()
-        steps = round(step / module.progress(step))  # fewer than asked for where the time ends before
+        steps = round(
+            step / module.progress(step)
+        )  # fewer than asked for where the time ends before
         first, began_s = self._began = self._began or (step, now_s)
         timed = step - first >= min(_TIMED_STEPS, steps - first) or now_s - began_s >= _TIMED_S
         if timed and step > first and not self._said:
             self._said = True
             took_s = (now_s - began_s) / (step - first)
-            logger.info("a step takes %.2g s, all %d steps take %s", took_s, steps, duration(round(steps * took_s)))
+            logger.info(
+                "a step takes %.2g s, all %d steps take %s",
+                took_s,
+                steps,
+                duration(round(steps * took_s)),
+            )
         self._progress(f"steps, loss {module.loss:.4g}", step, steps)
 
 
 CONFIG = "config.yaml"
 MEASUREMENTS = "teacher"  # measured before a run begins, and kept if it is interrupted there
-_BEGUN = {CONFIG, "checkpoints", "logs", "last", "best_pose"}  # left by a run that failed before its first weights
+_BEGUN = {
+    CONFIG,
+    "checkpoints",
+    "logs",
+    "last",
+    "best_pose",
+}  # left by a run that failed before its first weights
 
 
 class OutputFolder:
@@ -226,10 +261,16 @@ class OutputFolder:
         if not self.path.exists():
             return
         if not self.path.is_dir():
-            raise TrainingError(f"--output {self.path} is a file, not a folder: choose another --output")
+            raise TrainingError(
+                f"--output {self.path} is a file, not a folder: choose another --output"
+            )
         if self.checkpoint.is_file() or (self.path / "model.yaml").is_file():
-            raise TrainingError(f"{self.path} holds a run already: continue with --resume or choose another --output")
-        names = {entry.name for entry in self.path.iterdir() if ".partial." not in entry.name} - {MEASUREMENTS}
+            raise TrainingError(
+                f"{self.path} holds a run already: continue with --resume or choose another --output"
+            )
+        names = {entry.name for entry in self.path.iterdir() if ".partial." not in entry.name} - {
+            MEASUREMENTS
+        }
         foreign = sorted(names - _BEGUN)
         if foreign:
             raise TrainingError(
@@ -248,21 +289,37 @@ class OutputFolder:
         """
         for needed in (self.checkpoint, self.config):
             if not needed.is_file():
-                raise TrainingError(f"nothing to resume in {self.path}: no {needed.name}; start without --resume")
+                raise TrainingError(
+                    f"nothing to resume in {self.path}: no {needed.name}; start without --resume"
+                )
         wrong = "is damaged or no checkpoint: start again in another --output"
         state = read_torch(self.checkpoint, TrainingError, wrong)
         known = {"global_step", "state_dict", "optimizer_states", "loops", "known"}
         is_whole = isinstance(state, dict) and known <= state.keys()
-        if not is_whole or {name.partition(".")[0] for name in state["state_dict"]} != {"depth_net", "pose_net"}:
+        if not is_whole or {name.partition(".")[0] for name in state["state_dict"]} != {
+            "depth_net",
+            "pose_net",
+        }:
             raise TrainingError(f"{self.checkpoint} {wrong}")
-        begun, wanted = read_yaml(self.config), config.model_dump(mode="json")  # begun with settings of another version
-        sections = [begun.get(name) for name in ("network", "training")] if isinstance(begun, dict) else [None]
+        begun, wanted = (
+            read_yaml(self.config),
+            config.model_dump(mode="json"),
+        )  # begun with settings of another version
+        sections = (
+            [begun.get(name) for name in ("network", "training")]
+            if isinstance(begun, dict)
+            else [None]
+        )
         if not all(isinstance(section, dict) for section in sections):
             raise TrainingError(f"{self.config} is damaged: start again in another --output")
         if begun["network"] != wanted["network"]:
-            raise ConfigError(f"the networks of {self.config} differ from this configuration: resume with the same one")
+            raise ConfigError(
+                f"the networks of {self.config} differ from this configuration: resume with the same one"
+            )
         for key in ("networks", "frozen_stages"):
             before, now = begun["training"].get(key), wanted["training"][key]
             if before != now:
-                raise ConfigError(f"{self.config} began with training.{key} {before}; got {now}: resume with the same")
+                raise ConfigError(
+                    f"{self.config} began with training.{key} {before}; got {now}: resume with the same"
+                )
         return int(state["global_step"])

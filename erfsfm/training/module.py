@@ -41,13 +41,17 @@ class SelfSupervision(lightning.LightningModule):
         self.config = config
         self._clock = clock
         self.depth_net, self.pose_net = build_networks(config.network).values()
-        self.known: TrainedNetworks = config.training.networks  # those that are trained here, or were before
+        self.known: TrainedNetworks = (
+            config.training.networks
+        )  # those that are trained here, or were before
         self.depth_input: DepthInput | None = None  # of the network that this training goes on with
         # networks, and the stages of pretrained encoders, that keep their weights
         self.depth_net.requires_grad_(config.training.networks != "pose")
         self.pose_net.requires_grad_(config.training.networks != "depth")
         if isinstance(self.depth_net, Lite0DepthNet):
-            self.depth_net.encoder.stages[: config.training.frozen_stages].requires_grad_(False)  # the stem being one
+            self.depth_net.encoder.stages[: config.training.frozen_stages].requires_grad_(
+                False
+            )  # the stem being one
             # depthwise convolutions are a quarter faster so
             self.depth_net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.train()  # Lightning keeps the mode of each module
@@ -60,9 +64,14 @@ class SelfSupervision(lightning.LightningModule):
         """The network of that kind."""
         return self.depth_net if kind == "depth" else self.pose_net
 
-    def on_after_batch_transfer(self, batch: dict[str, Tensor], dataloader_idx: int) -> dict[str, Tensor]:
+    def on_after_batch_transfer(
+        self, batch: dict[str, Tensor], dataloader_idx: int
+    ) -> dict[str, Tensor]:
         """Colour to [0, 1] where the networks are; samples hold it as uint8, a quarter of the bytes to hand over."""
-        return {name: each.float() / 255 if each.dtype == torch.uint8 else each for name, each in batch.items()}
+        return {
+            name: each.float() / 255 if each.dtype == torch.uint8 else each
+            for name, each in batch.items()
+        }
 
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
         """The loss of one batch; `on_after_backward` stops the run where it is not finite or the depth a constant."""
@@ -70,7 +79,12 @@ class SelfSupervision(lightning.LightningModule):
         none = batch["target"].new_zeros(0, self.config.network.sources, *batch["target"].shape[1:])
         sources = batch.get("sources", none)
         snippets = SnippetBatch(
-            batch["target"], sources, batch["K"], batch.get("T_source_target"), bounds, batch.get("shown")
+            batch["target"],
+            sources,
+            batch["K"],
+            batch.get("T_source_target"),
+            bounds,
+            batch.get("shown"),
         )
         result = evaluate_objective(self.depth_net, self.pose_net, snippets, self.config)
         self._terms = {name: value.detach() for name, value in result.terms.items()}
@@ -134,9 +148,12 @@ class SelfSupervision(lightning.LightningModule):
             {"params": pretrained, "lr": training.learning_rate * training.encoder_rate},
         ]
         slowly = slowly[: 2 if pretrained else 1]
-        optimiser = torch.optim.Adam([{"params": rest}, *slowly], lr=training.learning_rate, betas=(0.9, 0.999))
+        optimiser = torch.optim.Adam(
+            [{"params": rest}, *slowly], lr=training.learning_rate, betas=(0.9, 0.999)
+        )
         schedule = torch.optim.lr_scheduler.LambdaLR(
-            optimiser, lambda step: learning_rate_factor(training.schedule, self.progress(step), step)
+            optimiser,
+            lambda step: learning_rate_factor(training.schedule, self.progress(step), step),
         )
         self._rates = list(schedule.base_lrs)
         return {"optimizer": optimiser, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
@@ -172,7 +189,9 @@ class SelfSupervision(lightning.LightningModule):
             disparity = self.depth_net(target).float()
             self._note_depth(disparity, batch.get("depth"))
         if self.known != "depth":
-            T_source_target = pose_vector_to_matrix(self.pose_net(target, list(sources.unbind(dim=1))).float())
+            T_source_target = pose_vector_to_matrix(
+                self.pose_net(target, list(sources.unbind(dim=1))).float()
+            )
             self._note_poses(T_source_target, batch.get("T_source_target"))
         if disparity is not None and T_source_target is not None:
             with torch.autocast(self.device.type, enabled=False):
@@ -215,7 +234,9 @@ class SelfSupervision(lightning.LightningModule):
     def on_validation_epoch_end(self) -> None:
         """Note and log what the first process measured, by which all of them decide what to keep."""
         self.validation_metrics = self.trainer.strategy.broadcast(self.measured())
-        self.log_dict({f"validation/{name}": value for name, value in self.validation_metrics.items()})
+        self.log_dict(
+            {f"validation/{name}": value for name, value in self.validation_metrics.items()}
+        )
 
     def measured(self) -> dict[str, float]:
         """Mean of every metric, and the spread of the depth scale, which limits a SLAM system's scale drift."""
@@ -234,7 +255,9 @@ def decisive(metrics: dict[str, float], networks: TrainedNetworks = "both") -> f
 
     Without ground truth it is the photometric error, which needs both networks; else infinite.
     """
-    value = metrics.get("snippet_ate" if networks == "pose" else "abs_rel", metrics.get("photometric", math.inf))
+    value = metrics.get(
+        "snippet_ate" if networks == "pose" else "abs_rel", metrics.get("photometric", math.inf)
+    )
     return value if math.isfinite(value) else math.inf
 
 

@@ -46,7 +46,9 @@ class SnippetBatch:
     def seen(self) -> tuple[Tensor, list[Tensor]]:
         """Target and sources as the networks see them, in [-1, 1]."""
         if self.shown is None:
-            return to_network_range(self.target), [to_network_range(source) for source in self.sources.unbind(dim=1)]
+            return to_network_range(self.target), [
+                to_network_range(source) for source in self.sources.unbind(dim=1)
+            ]
         images = [to_network_range(image) for image in self.shown.unbind(dim=1)]
         target = images.pop(len(images) // 2)
         return torch.cat([to_network_range(self.target[: -len(target)]), target]), images
@@ -119,7 +121,10 @@ def needs_poses(config: ExperimentConfig) -> bool:
 
 
 def _evaluate(
-    disparities: list[Tensor], T_source_target: Tensor, batch: SnippetBatch, config: ExperimentConfig
+    disparities: list[Tensor],
+    T_source_target: Tensor,
+    batch: SnippetBatch,
+    config: ExperimentConfig,
 ) -> ObjectiveResult:
     """The loss of the networks' outputs, disparities ``(B, 1, h, w)`` and poses ``(S, N, 4, 4)``."""
     loss = config.loss
@@ -201,7 +206,9 @@ class Level:
         middle = self.sources.shape[1] // 2
         with torch.no_grad():
             before, after = self.sources[:, middle - 1], self.sources[:, middle]
-            unwarped = [photometric_error(self.target, image, loss.ssim_weight) for image in (before, after)]
+            unwarped = [
+                photometric_error(self.target, image, loss.ssim_weight) for image in (before, after)
+            ]
             still = torch.minimum(*unwarped)[:, 0]  # (B, h, w)
         counted = valid.any(dim=1) & (best.detach() < still)
         return best.masked_fill(~counted, 0).sum() / counted.sum().clamp(min=1)

@@ -48,7 +48,9 @@ from erfsfm.training.objective import needs_poses
 
 logger = logging.getLogger(__name__)
 
-_LOGGED_EVERY = 50  # steps: a hundredth of the shortest useful training; a shorter one is logged at its end
+_LOGGED_EVERY = (
+    50  # steps: a hundredth of the shortest useful training; a shorter one is logged at its end
+)
 _LEFT_OUT = ("method", "leak")  # the same in all rows
 
 
@@ -78,7 +80,9 @@ def train(
     on_cpu = choose_device(device) == "cpu"
     there = (os.cpu_count() or 1) if on_cpu else torch.cuda.device_count()
     if (devices := config.training.devices) > there:
-        raise ConfigError(f"training.devices is {devices} on a machine with {there}: set {there} or fewer")
+        raise ConfigError(
+            f"training.devices is {devices} on a machine with {there}: set {there} or fewer"
+        )
     folder = OutputFolder(output)
     rank = LightningEnvironment().local_rank()
     done_steps = folder.resumable_steps(config) if resume else 0
@@ -86,19 +90,31 @@ def train(
         folder.require_free()
     training, validation = split_recordings(config.data)
     if config.data.validation and not validation and rank == 0:
-        logger.warning("training runs without validation: no recording of data.validation is among the data")
+        logger.warning(
+            "training runs without validation: no recording of data.validation is among the data"
+        )
     lightning.seed_everything(config.training.seed, verbose=False)
-    timer = Timer(timedelta(minutes=config.training.minutes) or None, verbose=False)  # keeps its time in checkpoints
+    timer = Timer(
+        timedelta(minutes=config.training.minutes) or None, verbose=False
+    )  # keeps its time in checkpoints
     module = SelfSupervision(config, timer.time_elapsed)
     draws = _draws(config, training, done_steps, output, progress)
-    validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
+    validation_loader = (
+        DataLoader(ValidationSnippets(validation, config), 1) if validation else None
+    )
     before = [] if resume else _start_from(module, config)
     seen = merge([*trained_on(draws.recordings), *before, *seen_by_imitated(config)])
-    keeper = WeightKeeper(output, seen, command, bool(validation), config.training, choose_device(device))
+    keeper = WeightKeeper(
+        output, seen, command, bool(validation), config.training, choose_device(device)
+    )
     if resume:
         module.validation_metrics = keeper.metrics_at(done_steps)
     loader = DataLoader(
-        draws, config.training.batch, num_workers=config.data.workers, pin_memory=not on_cpu, collate_fn=stacked
+        draws,
+        config.training.batch,
+        num_workers=config.data.workers,
+        pin_memory=not on_cpu,
+        collate_fn=stacked,
     )
     trainer = _trainer(config, output, device, (keeper, timer, StepProgress(progress)), done_steps)
     with raising_on_termination(), FolderLock() as lock:
@@ -121,14 +137,20 @@ def prepare(config: ExperimentConfig, output: Path, progress: Progress = silent)
         TrainingError: the teacher cannot measure a drive.
     """
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise ConfigError(f"--prepare {output} is not empty: choose a new folder; nothing was changed")
+        raise ConfigError(
+            f"--prepare {output} is not empty: choose a new folder; nothing was changed"
+        )
     if config.data.validation_share > 0:  # it would be taken off again
-        raise ConfigError("--prepare keeps whole recordings to validate on: set data.validation_share=0")
+        raise ConfigError(
+            "--prepare keeps whole recordings to validate on: set data.validation_share=0"
+        )
     training, validation = split_recordings(config.data)
     training = usable(training, config.network.sources + 1)
     held_out = ValidationSnippets(validation, config).snippets if validation else []
     with tempfile.TemporaryDirectory() as temporary:
-        teacher = measured_views(training, config, config.teacher.cache or Path(temporary), progress)
+        teacher = measured_views(
+            training, config, config.teacher.cache or Path(temporary), progress
+        )
         write_prepared(output, training, held_out, teacher, config.network, progress)
 
 
@@ -151,20 +173,31 @@ def depth_before_and_after(
     for when, weights in (("before", config.initial_weights), ("after", str(output))):
         networks = DepthPosePredictor.from_weights(weights, device)
         errors = many_view_protocol(networks, validation, cache, True, progress)
-        rows += [{"depth": when} | {key: row[key] for key in row if key not in _LEFT_OUT} for row in errors]
+        rows += [
+            {"depth": when} | {key: row[key] for key in row if key not in _LEFT_OUT}
+            for row in errors
+        ]
     return rows
 
 
 def _draws(
-    config: ExperimentConfig, training: list[Recording], done_steps: int, output: Path, progress: Progress
+    config: ExperimentConfig,
+    training: list[Recording],
+    done_steps: int,
+    output: Path,
+    progress: Progress,
 ) -> SnippetDraws:
     """What this process trains on after some steps."""
     together = config.training.batch * config.training.devices
-    views = measured_views(training, config, config.teacher.cache or output / MEASUREMENTS, progress)
+    views = measured_views(
+        training, config, config.teacher.cache or output / MEASUREMENTS, progress
+    )
     last, done = config.training.steps * together, done_steps * together
     imitates = config.teacher.views == "network"
     imitated = partial(learned_inverse_depth, config.teacher.slam_weights) if imitates else None
-    return SnippetDraws(training, config, last, done, LightningEnvironment().local_rank(), views, imitated)
+    return SnippetDraws(
+        training, config, last, done, LightningEnvironment().local_rank(), views, imitated
+    )
 
 
 def trained_on(recordings: list[Recording]) -> list[str]:
@@ -184,16 +217,30 @@ def _fit(
     try:
         with opencv_threads(1), warnings.catch_warnings():
             warnings.simplefilter("ignore", PossibleUserWarning)
-            warnings.filterwarnings("ignore", ".*(treespec|ckpt_path|dirpath has|Checkpoint directory|logs directory)")
-            trainer.fit(module, loader, validation_loader, ckpt_path=checkpoint if resume else None, weights_only=True)
+            warnings.filterwarnings(
+                "ignore", ".*(treespec|ckpt_path|dirpath has|Checkpoint directory|logs directory)"
+            )
+            trainer.fit(
+                module,
+                loader,
+                validation_loader,
+                ckpt_path=checkpoint if resume else None,
+                weights_only=True,
+            )
     except (SystemExit, RuntimeError) as error:
-        again = "continue with --resume" if checkpoint.is_file() else "start again, for it has no checkpoint yet"
+        again = (
+            "continue with --resume"
+            if checkpoint.is_file()
+            else "start again, for it has no checkpoint yet"
+        )
         if isinstance(error, SystemExit):  # Lightning turns ctrl-C into one
             number = getattr(error, "number", signal.SIGINT)
             raise Terminated(number, f" at step {trainer.global_step}: {again}") from error
         if "DataLoader worker" not in str(error):
             raise
-        raise TrainingError(f"a data loader was killed, for want of memory or by a signal: {again}") from error
+        raise TrainingError(
+            f"a data loader was killed, for want of memory or by a signal: {again}"
+        ) from error
 
 
 def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:
@@ -221,7 +268,10 @@ def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:
         raise ConfigError(f"initial_weights '{name}' are of another network: {error}") from error
     if model.record.networks != module.known:
         module.known = "both"
-    if (model.record.network.depth, model.record.network.depth_width) == (wanted.depth, wanted.depth_width):
+    if (model.record.network.depth, model.record.network.depth_width) == (
+        wanted.depth,
+        wanted.depth_width,
+    ):
         module.depth_input = model.record.depth_input
     return model.record.trained_on
 
@@ -280,7 +330,9 @@ def _trainer(
 class AtomicCheckpoints(TorchCheckpointIO):
     """Checkpoints that are replaced atomically; Lightning's go through another file system."""
 
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
+    ) -> None:
         """Write ``checkpoint`` to ``path``."""
         content = io.BytesIO()  # as in `save_model`
         torch.save(checkpoint, content)
@@ -299,7 +351,9 @@ def seen_by_imitated(config: ExperimentConfig) -> list[str]:
         return []
     record = read_record(find_weights(name) / "model.yaml")
     if record.networks == "pose":
-        raise ConfigError(f"teacher.slam_weights '{name}' have no depth network to imitate: name weights that have one")
+        raise ConfigError(
+            f"teacher.slam_weights '{name}' have no depth network to imitate: name weights that have one"
+        )
     return record.trained_on
 
 
@@ -323,6 +377,8 @@ def measured_views(
     size = (config.network.height, config.network.width)
     with_depth = config.training.networks != "pose"
     learned = partial(learned_inverse_depth, config.teacher.slam_weights)
-    teacher = ManyViewTeacher(folder, size, config.teacher.stride, labels_mb(config.data), with_depth, learned)
+    teacher = ManyViewTeacher(
+        folder, size, config.teacher.stride, labels_mb(config.data), with_depth, learned
+    )
     teacher.prepare(measured, config.network.sources, config.teacher.slam_weights, progress)
     return teacher

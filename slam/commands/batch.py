@@ -47,7 +47,10 @@ _COLUMNS: dict[str, tuple[Callable[[Metrics], object], int | None]] = {
     "length_m": (lambda m: m.sequence.length_m, 0),
     "scale": (lambda m: m.scale.mode, None),
     "unit": (lambda m: m.unit, 0),
-    "ate_6dof_m": (lambda m: m.trajectories.optimised.align.dof6.ate_rmse_m if m.is_metric else None, 3),
+    "ate_6dof_m": (
+        lambda m: m.trajectories.optimised.align.dof6.ate_rmse_m if m.is_metric else None,
+        3,
+    ),
     "ate_7dof_m": (lambda m: m.trajectories.optimised.align.dof7.ate_rmse_m, 3),
     "t_rel_percent": (lambda m: m.trajectories.optimised.align.dof7.t_rel_percent, 2),
     "r_rel_deg_per_100m": (lambda m: m.trajectories.optimised.align.dof7.r_rel_deg_per_100m, None),
@@ -84,7 +87,12 @@ class Outcome:
 
 
 def options_of_drives(
-    weights: str | None, config: str | None, overrides: Sequence[str], frames: str | None, seed: int, device: str
+    weights: str | None,
+    config: str | None,
+    overrides: Sequence[str],
+    frames: str | None,
+    seed: int,
+    device: str,
 ) -> list[str]:
     """Options of ``run`` for all drives, with paths that hold in the folder of each."""
     load_config(config, overrides)
@@ -93,9 +101,15 @@ def options_of_drives(
     words = []
     for override in overrides:
         key, equals, value = override.partition("=")
-        words += ["--set", key + equals + (source_from_anywhere(value) if key == "depth.source" else value)]
+        words += [
+            "--set",
+            key + equals + (source_from_anywhere(value) if key == "depth.source" else value),
+        ]
     if weights is not None:
-        words += ["--weights", from_anywhere(weights) if Path(weights, "model.yaml").is_file() else weights]
+        words += [
+            "--weights",
+            from_anywhere(weights) if Path(weights, "model.yaml").is_file() else weights,
+        ]
     if config is not None:
         words += ["--config", from_anywhere(config) if Path(config).is_file() else config]
     if frames is not None:
@@ -103,7 +117,9 @@ def options_of_drives(
     return [*words, "--seed", str(seed), "--device", device]
 
 
-def drives_of(manifest_or_root: Path, sequences: Sequence[str], options: Sequence[str]) -> list[Drive]:
+def drives_of(
+    manifest_or_root: Path, sequences: Sequence[str], options: Sequence[str]
+) -> list[Drive]:
     """The drives of a manifest, or the named sequences of a data set, ``all`` of them every one.
 
     These ``options`` of ``run`` are for all drives; those of a manifest come after them.
@@ -157,7 +173,10 @@ def run_drives(
 
 
 def spread(
-    work: Callable[[Drive], Outcome], drives: Sequence[Drive], count: int = 1, scheduler: str | None = None
+    work: Callable[[Drive], Outcome],
+    drives: Sequence[Drive],
+    count: int = 1,
+    scheduler: str | None = None,
 ) -> Iterator[tuple[int, Outcome | BaseException]]:
     """The number and the result of each drive, as they end; the result of work that fails is its exception.
 
@@ -172,12 +191,23 @@ def spread(
         return
     (distributed,) = import_extra("cluster")
     # memory is that of each drive's process, whose limit is not Dask's
-    local = {"n_workers": count, "threads_per_worker": 1, "dashboard_address": ":0", "memory_limit": None}
+    local = {
+        "n_workers": count,
+        "threads_per_worker": 1,
+        "dashboard_address": ":0",
+        "memory_limit": None,
+    }
     local |= {"silence_logs": logging.CRITICAL}
     try:
-        client = distributed.Client(scheduler, timeout="10s") if scheduler else distributed.Client(**local)
+        client = (
+            distributed.Client(scheduler, timeout="10s")
+            if scheduler
+            else distributed.Client(**local)
+        )
     except (OSError, ValueError) as error:
-        raise SlamError(f"no Dask scheduler answers at {scheduler}: {' '.join(str(error).split())}") from error
+        raise SlamError(
+            f"no Dask scheduler answers at {scheduler}: {' '.join(str(error).split())}"
+        ) from error
     with client:
         futures = client.map(work, drives, pure=False)
         numbers = {future.key: number for number, future in enumerate(futures)}
@@ -206,7 +236,9 @@ def check_output(output: Path, drives: Sequence[Drive]) -> None:
     if output.exists() and not output.is_dir():
         raise RunError(f"{output} is a file: give a folder as --output")
     if CSV in {drive.name for drive in drives}:
-        raise RunError(f"a drive is named {CSV}, as a file of the batch: give it another name in the manifest")
+        raise RunError(
+            f"a drive is named {CSV}, as a file of the batch: give it another name in the manifest"
+        )
     refuse_foreign([output / CSV], _CSV_BEGIN, RunError)
     for drive in drives:
         refuse_foreign([output / f"{drive.name}.log"], _LOG_BEGIN, RunError)
@@ -216,12 +248,22 @@ def summary_table(outcomes: Sequence[Outcome]) -> Table:
     """The main numbers of the runs that are whole, and why others failed."""
     shown = {name: decimals for name, (_, decimals) in _COLUMNS.items() if decimals is not None}
     rows = [
-        [row["drive"], row["status"], *(written(row[name], decimals) for name, decimals in shown.items())]
+        [
+            row["drive"],
+            row["status"],
+            *(written(row[name], decimals) for name, decimals in shown.items()),
+        ]
         for row in map(_row, outcomes)
         if row["status"] != "failed"
     ]
-    notes = [f"{outcome.drive.name} failed: {outcome.reason}" for outcome in outcomes if outcome.status == "failed"]
-    return Table(["drive", "status", *(name.replace("_", "\n", 1) for name in shown)], rows, notes=notes)
+    notes = [
+        f"{outcome.drive.name} failed: {outcome.reason}"
+        for outcome in outcomes
+        if outcome.status == "failed"
+    ]
+    return Table(
+        ["drive", "status", *(name.replace("_", "\n", 1) for name in shown)], rows, notes=notes
+    )
 
 
 def _of_data_set(root: Path, sequences: Sequence[str], options: Sequence[str]) -> list[Drive]:
@@ -242,19 +284,24 @@ def _manifest(path: Path, options: Sequence[str]) -> list[Drive]:
     try:
         lines = io.StringIO(read_text(path), newline="")
         rows = [
-            {key: word for key, word in row.items() if word} for row in csv.DictReader(lines, skipinitialspace=True)
+            {key: word for key, word in row.items() if word}
+            for row in csv.DictReader(lines, skipinitialspace=True)
         ]
     except FileNotFoundError as error:
         raise SequenceError(f"no manifest {path}: check the path") from error
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SequenceError(f"the manifest {path} cannot be read: {getattr(error, 'strerror', error)}") from error
+        raise SequenceError(
+            f"the manifest {path} cannot be read: {getattr(error, 'strerror', error)}"
+        ) from error
     if not rows:
         raise SequenceError(f"{path} names no drive: give rows of {', '.join(_KEYS)}")
     given = [row["name"] for row in rows if "name" in row]
     twice = next((name for name in given if given.count(name) > 1), None)
     if twice is not None:
         raise SequenceError(f"{path}: two drives are named {twice}: choose other names")
-    return _named(_drive(row, path, f"{path}, drive {number}", options) for number, row in enumerate(rows, 1))
+    return _named(
+        _drive(row, path, f"{path}, drive {number}", options) for number, row in enumerate(rows, 1)
+    )
 
 
 def _drive(row: dict[str, str], path: Path, where: str, options: Sequence[str]) -> Drive:
@@ -268,7 +315,12 @@ def _drive(row: dict[str, str], path: Path, where: str, options: Sequence[str]) 
         raise SequenceError(
             f"{where}: options are not understood ({error}): write them as on a command line"
         ) from error
-    named = [word for key in ("dataset", "sequence", "camera") if key in row for word in (f"--{key}", row[key])]
+    named = [
+        word
+        for key in ("dataset", "sequence", "camera")
+        if key in row
+        for word in (f"--{key}", row[key])
+    ]
     name = row.get("name") or row.get("sequence") or Path(row["dataset"]).stem
     return Drive(name, path.absolute().parent, (*named, *options, *own))
 
@@ -292,11 +344,17 @@ def _is_whole(folder: Path, arguments: list[str]) -> bool:
         metrics = RunFolder(folder).metrics()
     except SlamError:
         return False
-    return metrics.status == "ok" and metrics.provenance.command == shlex.join(["erfsfm-slam", *arguments])
+    return metrics.status == "ok" and metrics.provenance.command == shlex.join(
+        ["erfsfm-slam", *arguments]
+    )
 
 
 def _row(outcome: Outcome) -> dict[str, Any]:
-    row: dict[str, Any] = {"drive": outcome.drive.name, "status": outcome.status, "reason": outcome.reason}
+    row: dict[str, Any] = {
+        "drive": outcome.drive.name,
+        "status": outcome.status,
+        "reason": outcome.reason,
+    }
     if outcome.status == "failed":
         return row | dict.fromkeys(_COLUMNS)
     metrics = RunFolder(outcome.folder).metrics()
@@ -309,7 +367,9 @@ def _end_with_the_worker() -> None:
     os.kill(os.getpid(), signal.SIGTERM)
 
 
-if __name__ == "__main__":  # LOCK run ...: a drive, which ends when its standard input does; no two to one folder
+if (
+    __name__ == "__main__"
+):  # LOCK run ...: a drive, which ends when its standard input does; no two to one folder
     lock = Path(sys.argv.pop(1)).open("w", encoding="utf-8")  # noqa: SIM115 - held until the process ends
     fcntl.flock(lock, fcntl.LOCK_EX)
     threading.Thread(target=_end_with_the_worker, daemon=True).start()

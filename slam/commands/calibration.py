@@ -82,12 +82,18 @@ class Board:
         """OpenCV's ChArUco board."""
         number = getattr(cv2.aruco, f"DICT_{self.dictionary}", None)
         if number is None or not _DICTIONARY.fullmatch(self.dictionary):
-            raise SlamError(f"--dictionary {self.dictionary} is none of OpenCV's: write it as 5X5_100 or 4X4_50")
+            raise SlamError(
+                f"--dictionary {self.dictionary} is none of OpenCV's: write it as 5X5_100 or 4X4_50"
+            )
         squares = (self.columns + 1, self.rows + 1)
         dictionary = cv2.aruco.getPredefinedDictionary(number)
         if squares[0] * squares[1] // 2 > len(dictionary.bytesList):
-            raise SlamError(f"dictionary {self.dictionary} has too few markers for {squares[0]}x{squares[1]} squares")
-        return cv2.aruco.CharucoBoard(squares, self.square_m, self.marker_share * self.square_m, dictionary)
+            raise SlamError(
+                f"dictionary {self.dictionary} has too few markers for {squares[0]}x{squares[1]} squares"
+            )
+        return cv2.aruco.CharucoBoard(
+            squares, self.square_m, self.marker_share * self.square_m, dictionary
+        )
 
     def describe(self) -> str:
         """As ``9x6 chessboard``."""
@@ -204,7 +210,9 @@ def _view(frame: int, grey: Grey, pixels: FloatArray, corners_m: FloatArray) -> 
     height, width = grey.shape
     hull = cv2.convexHull(pixels.astype(np.float32))
     mask = cv2.fillConvexPoly(np.zeros_like(grey), np.rint(hull).astype(np.int32), 255) > 0
-    sharpness = float(cv2.Laplacian(grey, cv2.CV_64F)[mask].var() / max(float(grey[mask].var()), 1.0))
+    sharpness = float(
+        cv2.Laplacian(grey, cv2.CV_64F)[mask].var() / max(float(grey[mask].var()), 1.0)
+    )
     extent = np.ptp(corners_m[:, :2], axis=0)
     plane = (corners_m[:, :2] - corners_m[:, :2].mean(axis=0)) / extent
     homography, _ = cv2.findHomography(plane, pixels / width)
@@ -252,12 +260,16 @@ class Calibration:
     @property
     def tilts_deg(self) -> FloatArray:
         """Angle between the board and the image plane in each view ``(V,)``."""
-        return np.asarray(np.rad2deg(np.arccos(np.clip(np.abs(self.T_camera_board[:, 2, 2]), 0, 1))))
+        return np.asarray(
+            np.rad2deg(np.arccos(np.clip(np.abs(self.T_camera_board[:, 2, 2]), 0, 1)))
+        )
 
     @property
     def covered(self) -> float:
         """Share of the image inside the convex hull of all corners."""
-        hull = cv2.convexHull(np.concatenate([view.pixels for view in self.views]).astype(np.float32))
+        hull = cv2.convexHull(
+            np.concatenate([view.pixels for view in self.views]).astype(np.float32)
+        )
         return float(cv2.contourArea(hull)) / (self.width * self.height)
 
 
@@ -275,7 +287,9 @@ def calibrate_camera(
         SequenceError: the images cannot be read.
     """
     if output.suffix not in (".yaml", ".yml"):
-        raise SlamError(f"--output {output} must end in .yaml: it is the camera file that run reads")
+        raise SlamError(
+            f"--output {output} must end in .yaml: it is the camera file that run reads"
+        )
     among_images = any(path.stem != output.stem for path in list_images(output.parent))
     picture = output.with_suffix(".pdf" if among_images else ".png")
     refuse_foreign([output], "fx:", SlamError)  # any camera file may be calibrated again
@@ -310,9 +324,13 @@ def calibrate_camera(
         f"reprojection error {fit.error_px:.3f} pixels, worst view {fit.errors_px.max():.3f}",
     ]
     if fit.covered < _WELL_COVERED:
-        lines.append("corners fill little of the image: show the board at its borders, where the lens is less certain")
+        lines.append(
+            "corners fill little of the image: show the board at its borders, where the lens is less certain"
+        )
     if fps is None and recording.is_dir():
-        lines.append(f"fps {camera.fps:g} is assumed: images have no rate; give --fps, or correct it in the file")
+        lines.append(
+            f"fps {camera.fps:g} is assumed: images have no rate; give --fps, or correct it in the file"
+        )
     return [*lines, f"camera in {output}, its fit drawn in {picture}"]
 
 
@@ -325,7 +343,12 @@ def fit_camera(views: list[View], width: int, height: int, model: Model) -> Cali
     fit = _fit(views, width, height, model)
     good = fit.errors_px <= _OUTLIER * np.median(fit.errors_px)
     if not good.all():
-        fit = _fit([view for view, is_good in zip(views, good, strict=True) if is_good], width, height, model)
+        fit = _fit(
+            [view for view, is_good in zip(views, good, strict=True) if is_good],
+            width,
+            height,
+            model,
+        )
     advice = "tilt it by 20 to 45 degrees about both axes, near and far, also at the borders of the image"
     steepest, most_error = float(fit.tilts_deg.max()), _MOST_ERROR_PX * max(fit.width / 640, 1.0)
     faults = {
@@ -346,7 +369,9 @@ def fit_camera(views: list[View], width: int, height: int, model: Model) -> Cali
 
 def _fit(views: list[View], width: int, height: int, model: Model) -> Calibration:
     if len(views) < _FEWEST_VIEWS:
-        raise SlamError(f"{len(views)} sharp views fit one camera, {_FEWEST_VIEWS} are needed: take more images")
+        raise SlamError(
+            f"{len(views)} sharp views fit one camera, {_FEWEST_VIEWS} are needed: take more images"
+        )
     try:
         if model == "fisheye":
             return _fit_lens(views, width, height, model, _FISHEYE_FLAGS)
@@ -369,11 +394,15 @@ def _fit_lens(views: list[View], width: int, height: int, model: Model, flags: i
     corners = [view.corners_m[None].astype(precision) for view in views]
     pixels = [view.pixels[None].astype(precision) for view in views]
     start = (np.zeros((3, 3)), np.zeros((4, 1))) if is_fisheye else (None, None)
-    _, K, distortion, turns, places = calibrate(corners, pixels, (width, height), *start, flags=flags)
+    _, K, distortion, turns, places = calibrate(
+        corners, pixels, (width, height), *start, flags=flags
+    )
     distortion = distortion.ravel()[:5]
     count = 4 + len(distortion)
     # where the columns of the camera and of the pose are in OpenCV's derivatives
-    of_camera, of_pose = (slice(count), slice(count, count + 6)) if is_fisheye else (slice(6, 6 + count), slice(6))
+    of_camera, of_pose = (
+        (slice(count), slice(count, count + 6)) if is_fisheye else (slice(6, 6 + count), slice(6))
+    )
     residuals, information = [], np.zeros((count, count))
     T_camera_board = np.tile(np.eye(4), (len(views), 1, 1))
     for T, view, turn, place in zip(T_camera_board, views, turns, places, strict=True):
@@ -385,9 +414,15 @@ def _fit_lens(views: list[View], width: int, height: int, model: Model, flags: i
     freedom = sum(residual.size for residual in residuals) - count - 6 * len(views)
     variance = sum(float((residual**2).sum()) for residual in residuals) / max(freedom, 1)
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    inverse = np.linalg.pinv(information / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
-    sigma = float(np.sqrt(max(variance * inverse[:2, :2].mean(), 0.0))) / (0.5 * (K[0, 0] + K[1, 1]))
-    return Calibration(model, width, height, np.asarray(K), distortion, views, residuals, T_camera_board, sigma)
+    inverse = np.linalg.pinv(information / np.outer(scale, scale), hermitian=True) / np.outer(
+        scale, scale
+    )
+    sigma = float(np.sqrt(max(variance * inverse[:2, :2].mean(), 0.0))) / (
+        0.5 * (K[0, 0] + K[1, 1])
+    )
+    return Calibration(
+        model, width, height, np.asarray(K), distortion, views, residuals, T_camera_board, sigma
+    )
 
 
 def _write_picture(path: Path, fit: Calibration, camera: CameraFile, images: ImageSource) -> None:
@@ -400,15 +435,21 @@ def _write_picture(path: Path, fit: Calibration, camera: CameraFile, images: Ima
     image = images.read(fit.views[view].frame)
     longer = _ARROW_LENGTH * fit.width / max(fit.error_px, 1e-9)
     before.imshow(image)
-    before.plot(*np.concatenate([each.pixels for each in fit.views]).T, ".", color="#e69f00", markersize=2)
+    before.plot(
+        *np.concatenate([each.pixels for each in fit.views]).T, ".", color="#e69f00", markersize=2
+    )
     u, v = fit.views[view].pixels.T
     du, dv = longer * fit.residuals[view].T
-    before.quiver(u, v, du, dv, angles="xy", scale_units="xy", scale=1.0, color="#d55e00", width=0.003)
+    before.quiver(
+        u, v, du, dv, angles="xy", scale_units="xy", scale=1.0, color="#d55e00", width=0.003
+    )
     before.set_title(
         f"corners of {len(fit.views)} views; residuals of image {fit.views[view].frame}, {longer:.0f} times"
     )
     after.imshow(Undistortion(camera).apply(image) if camera.is_distorted else image)
-    after.set_title(f"image {fit.views[view].frame} undistorted: edges of the board must be straight")
+    after.set_title(
+        f"image {fit.views[view].frame} undistorted: edges of the board must be straight"
+    )
     for axis in (before, after):
         axis.set_axis_off()
     save_figure(figure, path, _DPI)
@@ -423,7 +464,9 @@ def _open(recording: Path) -> tuple[ImageSource, float | None]:
         return video, video.fps
     folder = image_folder(recording)
     if folder is None:
-        raise DataError(f"no images in {recording}: give a folder of png, jpg or bmp images, or a video")
+        raise DataError(
+            f"no images in {recording}: give a folder of png, jpg or bmp images, or a video"
+        )
     return ImageFiles(in_order(list_images(folder))), None
 
 

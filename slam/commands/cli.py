@@ -18,12 +18,19 @@ from slam.runtime.errors import RunError, SlamError
 if TYPE_CHECKING:
     from slam.results.folder import RunFolder
 
-app = command_line.application("erfsfm-slam", "Monocular SLAM on learned depth and ego-motion, on a CPU.")
+app = command_line.application(
+    "erfsfm-slam", "Monocular SLAM on learned depth and ego-motion, on a CPU."
+)
 
 Sequence = Annotated[
-    str | None, typer.Option("--sequence", "-s", help="name inside the data set, e.g. 09; of a bag the image topic")
+    str | None,
+    typer.Option(
+        "--sequence", "-s", help="name inside the data set, e.g. 09; of a bag the image topic"
+    ),
 ]
-Camera = Annotated[Path | None, typer.Option(help="camera.yaml, or fov=70: the horizontal field of view, degrees")]
+Camera = Annotated[
+    Path | None, typer.Option(help="camera.yaml, or fov=70: the horizontal field of view, degrees")
+]
 Frames = Annotated[str | None, typer.Option(help="A:B, half-open")]
 Weights = Annotated[str, typer.Option(help="default, sim, erf-dfc, erf-dfcv2 or a training output")]
 Config = Annotated[str | None, typer.Option(help="a YAML file or a shipped name")]
@@ -42,7 +49,8 @@ UnusedSeed = Annotated[int, typer.Option("--seed", hidden=True)]
 def run(
     context: typer.Context,
     dataset: Annotated[
-        Path | None, typer.Option(help="a data set, image folder or video: docs/recordings.md lists all kinds")
+        Path | None,
+        typer.Option(help="a data set, image folder or video: docs/recordings.md lists all kinds"),
     ] = None,
     sequence: Sequence = None,
     camera: Camera = None,
@@ -51,10 +59,13 @@ def run(
     overrides: Overrides = None,
     frames: Frames = None,
     truth: Annotated[
-        Path | None, typer.Option(help="true camera poses: KITTI (a row a frame) or TUM (by stamps)")
+        Path | None,
+        typer.Option(help="true camera poses: KITTI (a row a frame) or TUM (by stamps)"),
     ] = None,
     output: Output = None,
-    rerun: Annotated[Path | None, typer.Option(help="also write an .rrd file for the rerun viewer (extra)")] = None,
+    rerun: Annotated[
+        Path | None, typer.Option(help="also write an .rrd file for the rerun viewer (extra)")
+    ] = None,
     gps: Annotated[Path | None, typer.Option(help="GPS track, CSV or NMEA")] = None,
     seed: Seed = 0,
     device: Device = "auto",
@@ -77,14 +88,19 @@ def run(
 @app.command()
 def live(
     context: typer.Context,
-    dataset: Annotated[str, typer.Option(help="number of a camera, address of a stream, video, or folder")],
+    dataset: Annotated[
+        str, typer.Option(help="number of a camera, address of a stream, video, or folder")
+    ],
     camera: Camera = None,
     every_frame: Annotated[
-        bool, typer.Option("--every-frame", help="wait for each image of a folder or video; drop none")
+        bool,
+        typer.Option("--every-frame", help="wait for each image of a folder or video; drop none"),
     ] = False,
     output: Output = None,
     view: Annotated[bool, typer.Option("--view", help="open the rerun viewer (extra)")] = False,
-    wait: Annotated[float, typer.Option(min=0.1, max=1e6, help="seconds without an image that end the stream")] = 10.0,
+    wait: Annotated[
+        float, typer.Option(min=0.1, max=1e6, help="seconds without an image that end the stream")
+    ] = 10.0,
     weights: Weights = "default",
     config: Config = None,
     overrides: Overrides = None,
@@ -97,7 +113,9 @@ def live(
     """
     from slam.commands.live import LiveRequest, run_live
 
-    folder = run_live(LiveRequest.of(**_given(context)), lambda message: typer.echo(json.dumps(message)))
+    folder = run_live(
+        LiveRequest.of(**_given(context)), lambda message: typer.echo(json.dumps(message))
+    )
     typer.echo(f"everything in {folder.path}", err=True)
 
 
@@ -109,11 +127,18 @@ def batch(
         list[str] | None, typer.Option("--sequence", "-s", help="sequence of the data set; repeat")
     ] = None,
     workers: Annotated[int, typer.Option(min=1, help="drives at a time on this machine")] = 1,
-    scheduler: Annotated[str | None, typer.Option(help="address of a Dask scheduler in place of this machine")] = None,
-    threads: Annotated[
-        int | None, typer.Option(min=1, help="threads of a drive; default: the cores of this machine by the workers")
+    scheduler: Annotated[
+        str | None, typer.Option(help="address of a Dask scheduler in place of this machine")
     ] = None,
-    memory: Annotated[float, typer.Option(min=0, help="GiB that a drive may use; 0: all (Linux)")] = 0.0,
+    threads: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="threads of a drive; default: the cores of this machine by the workers"
+        ),
+    ] = None,
+    memory: Annotated[
+        float, typer.Option(min=0, help="GiB that a drive may use; 0: all (Linux)")
+    ] = 0.0,
     weights: Annotated[str | None, typer.Option(help="as for run")] = None,
     config: Config = None,
     overrides: Overrides = None,
@@ -136,7 +161,9 @@ def batch(
     summary_table(outcomes).print()
     failed = [outcome for outcome in outcomes if outcome.status == "failed"]
     kept = sum(outcome.status == "kept" for outcome in outcomes)
-    typer.echo(f"{len(outcomes)} drives, {kept} of them whole before, {len(failed)} failed: {output / CSV}")
+    typer.echo(
+        f"{len(outcomes)} drives, {kept} of them whole before, {len(failed)} failed: {output / CSV}"
+    )
     if failed:
         rest = "; the others are whole" if len(failed) < len(outcomes) else ""
         first = f"{failed[0].drive.name}: {failed[0].reason}"
@@ -146,13 +173,20 @@ def batch(
 @app.command()
 def evaluate(
     paths: Annotated[
-        list[str], typer.Argument(help="ESTIMATE REFERENCE (files or a run), or runs; with --reference any of both")
+        list[str],
+        typer.Argument(
+            help="ESTIMATE REFERENCE (files or a run), or runs; with --reference any of both"
+        ),
     ],
-    reference: Annotated[Path | None, typer.Option(help="the truth: a trajectory file or a run folder")] = None,
+    reference: Annotated[
+        Path | None, typer.Option(help="the truth: a trajectory file or a run folder")
+    ] = None,
     frames: Annotated[str | None, typer.Option(help="A:B of the reference, half-open")] = None,
     format: Annotated[Literal["auto", "kitti", "tum"], typer.Option(help="of the files")] = "auto",
     csv: Annotated[Path | None, typer.Option(help="all numbers, with --reference")] = None,
-    fail_over: Annotated[list[str] | None, typer.Option(help="METRIC=VALUE: exit 1 if it is larger; repeat")] = None,
+    fail_over: Annotated[
+        list[str] | None, typer.Option(help="METRIC=VALUE: exit 1 if it is larger; repeat")
+    ] = None,
     as_json: Json = False,
     seed: UnusedSeed = 0,
     device: UnusedDevice = "auto",
@@ -174,32 +208,43 @@ def evaluate(
         raise typer.BadParameter("--frames and --csv need --reference FILE")
     elif all(path.is_dir() for path in files):
         if limits:
-            raise typer.BadParameter("a limit applies to trajectory files: give --reference", param_hint="--fail-over")
+            raise typer.BadParameter(
+                "a limit applies to trajectory files: give --reference", param_hint="--fail-over"
+            )
         evaluation.of_runs(files, as_json)
     elif len(files) == 2:
         evaluation.of_two(files[0], files[1], format, limits, as_json)
     else:
         given = ", ".join(paths)
-        raise typer.BadParameter(f"give two trajectory files, run folders that exist, or --reference FILE; got {given}")
+        raise typer.BadParameter(
+            f"give two trajectory files, run folders that exist, or --reference FILE; got {given}"
+        )
 
 
 @app.command()
 def export(
     run: Annotated[Path, typer.Argument(help="a run folder")],
     what: Annotated[
-        Literal["mesh", "cloud", "colmap", "nerfstudio", "occupancy"], typer.Option(help="the part of the run")
+        Literal["mesh", "cloud", "colmap", "nerfstudio", "occupancy"],
+        typer.Option(help="the part of the run"),
     ],
-    output: Annotated[Path, typer.Option(help="the file to write; for colmap and nerfstudio a folder")],
+    output: Annotated[
+        Path, typer.Option(help="the file to write; for colmap and nerfstudio a folder")
+    ],
     up: Annotated[
         Literal["y-down", "z"], typer.Option(help="axes of the world: those of the camera, or z up")
     ] = "y-down",
     resolution: Annotated[
-        float | None, typer.Option(min=1e-6, help="side of a cell of an occupancy grid, 0.1 by default")
+        float | None,
+        typer.Option(min=1e-6, help="side of a cell of an occupancy grid, 0.1 by default"),
     ] = None,
     dataset: Annotated[
-        Path | None, typer.Option(help="where the images of the run are now, for colmap and nerfstudio")
+        Path | None,
+        typer.Option(help="where the images of the run are now, for colmap and nerfstudio"),
     ] = None,
-    points: Annotated[int | None, typer.Option(min=1, help="at most so many points of a COLMAP model")] = None,
+    points: Annotated[
+        int | None, typer.Option(min=1, help="at most so many points of a COLMAP model")
+    ] = None,
     seed: UnusedSeed = 0,
     device: UnusedDevice = "auto",
 ) -> None:
@@ -216,7 +261,14 @@ def export(
     folder = RunFolder.open(run)
     with progress_bar() as progress:
         written = export_run(
-            folder, what, output, up, resolution=resolution, dataset=dataset, points=points, progress=progress
+            folder,
+            what,
+            output,
+            up,
+            resolution=resolution,
+            dataset=dataset,
+            points=points,
+            progress=progress,
         )
     typer.echo(f"{what} of {run} in {written}")
     for note in folder.metrics().unit_notes():
@@ -228,12 +280,14 @@ def localize(
     images: Annotated[Path, typer.Argument(help="an image or a folder of images")],
     map: Annotated[Path, typer.Option("--map", help="a run folder")],
     camera: Annotated[
-        Path | None, typer.Option(help="camera.yaml or fov=70; default: beside the images, else the run's")
+        Path | None,
+        typer.Option(help="camera.yaml or fov=70; default: beside the images, else the run's"),
     ] = None,
     frames: Annotated[str | None, typer.Option(help="A:B of the images, half-open")] = None,
     every: Annotated[int, typer.Option(min=1, help="every n-th of them")] = 1,
     output: Annotated[
-        Path | None, typer.Option(help="poses found, as TUM with image numbers as stamps, or .kitti")
+        Path | None,
+        typer.Option(help="poses found, as TUM with image numbers as stamps, or .kitti"),
     ] = None,
     as_json: Json = False,
     seed: UnusedSeed = 0,
@@ -265,7 +319,9 @@ def localize(
 def simulate(
     output: Annotated[Path, typer.Argument(help="the root to write")],
     route: Annotated[str, typer.Option(help="loop, grid or straight streets, or rooms")] = "loop",
-    frames: Annotated[int, typer.Option(help="about 1 m apart on a street; a loop needs 250 or more")] = 300,
+    frames: Annotated[
+        int, typer.Option(help="about 1 m apart on a street; a loop needs 250 or more")
+    ] = 300,
     seed: Seed = 0,
     width: Annotated[int, typer.Option(help="pixels")] = 416,
     height: Annotated[int, typer.Option(help="pixels")] = 128,
@@ -282,11 +338,13 @@ def simulate(
     varied: Annotated[
         bool,
         typer.Option(
-            "--varied", help="any camera, hills, hard light, kinds of street, people, overtaking; of rooms another lens"
+            "--varied",
+            help="any camera, hills, hard light, kinds of street, people, overtaking; of rooms another lens",
         ),
     ] = False,
     motion: Annotated[
-        str | None, typer.Option(help="how the camera goes through rooms: walk, look, phone, drone or robot")
+        str | None,
+        typer.Option(help="how the camera goes through rooms: walk, look, phone, drone or robot"),
     ] = None,
     rate: Annotated[float, typer.Option(help="frames a second, of rooms 5 to 60")] = 10.0,
     device: UnusedDevice = "auto",
@@ -299,26 +357,41 @@ def simulate(
     from slam.simulation.options import SimulationOptions
 
     named = tuple(name.strip() for name in hazards.split(",") if name.strip())
-    world = simulated_world(SimulationOptions(route, frames, seed, width, height, named, varied, motion, rate))
+    world = simulated_world(
+        SimulationOptions(route, frames, seed, width, height, named, varied, motion, rate)
+    )
     with progress_bar() as progress:
-        write_kitti_root(world, output, depth, lidar, lambda done: progress("frames", done, frames), mesh)
+        write_kitti_root(
+            world, output, depth, lidar, lambda done: progress("frames", done, frames), mesh
+        )
     typer.echo(f"{frames} frames in {output}: erfsfm-slam run --dataset {output} --sequence sim")
 
 
 @app.command()
 def calibrate(
     recording: Annotated[Path, typer.Argument(help="a video or a folder of images of the board")],
-    board: Annotated[str, typer.Option(help="corners between the squares: 9x6 for 10 by 7 squares")],
+    board: Annotated[
+        str, typer.Option(help="corners between the squares: 9x6 for 10 by 7 squares")
+    ],
     output: Annotated[Path, typer.Option(help="the camera.yaml to write")] = Path("camera.yaml"),
-    square_m: Annotated[float, typer.Option(min=1e-4, max=10.0, help="side of a square in metres")] = 0.03,
-    model: Annotated[Literal["opencv", "fisheye"], typer.Option(help="lens; fisheye beyond 110 degrees")] = "opencv",
-    pattern: Annotated[Literal["chessboard", "charuco"], typer.Option(help="pattern of the board")] = "chessboard",
-    dictionary: Annotated[str, typer.Option(help="OpenCV's dictionary of the ArUco markers")] = "5X5_100",
+    square_m: Annotated[
+        float, typer.Option(min=1e-4, max=10.0, help="side of a square in metres")
+    ] = 0.03,
+    model: Annotated[
+        Literal["opencv", "fisheye"], typer.Option(help="lens; fisheye beyond 110 degrees")
+    ] = "opencv",
+    pattern: Annotated[
+        Literal["chessboard", "charuco"], typer.Option(help="pattern of the board")
+    ] = "chessboard",
+    dictionary: Annotated[
+        str, typer.Option(help="OpenCV's dictionary of the ArUco markers")
+    ] = "5X5_100",
     marker_share: Annotated[
         float, typer.Option(min=0.1, max=0.99, help="side of a marker over that of a square")
     ] = 0.75,
     fps: Annotated[
-        float | None, typer.Option(min=1e-3, max=1e4, help="frame rate to write; default: the video's, or 10")
+        float | None,
+        typer.Option(min=1e-3, max=1e4, help="frame rate to write; default: the video's, or 10"),
     ] = None,
     seed: UnusedSeed = 0,
     device: UnusedDevice = "auto",
@@ -349,7 +422,9 @@ def download(
     accept_licence: Annotated[
         bool, typer.Option("--accept-licence", help="you accept the licence that is shown")
     ] = False,
-    mirror: Annotated[str | None, typer.Option(help="address of the archives, in place of the official one")] = None,
+    mirror: Annotated[
+        str | None, typer.Option(help="address of the archives, in place of the official one")
+    ] = None,
 ) -> None:
     """One sequence of KITTI odometry from its official server.
 
@@ -384,7 +459,9 @@ def config() -> None:
 @app.command()
 def doctor(
     dataset: Annotated[Path | None, typer.Option(help="a data set to check")] = None,
-    camera: Annotated[Path | None, typer.Option(help="camera.yaml of the data set, or fov=70")] = None,
+    camera: Annotated[
+        Path | None, typer.Option(help="camera.yaml of the data set, or fov=70")
+    ] = None,
 ) -> None:
     """Check the installation. Missing parts come with what to do, and exit code 1.
 
@@ -413,7 +490,9 @@ def _print_run(folder: RunFolder) -> None:
     else:
         errors_table(metrics.evaluated_errors(), title).print()
     if (sure := metrics.confidence.run) is not None:
-        typer.echo(f"confidence {written(sure, 2)}: this share of drives like it err by at most 1 % of their path")
+        typer.echo(
+            f"confidence {written(sure, 2)}: this share of drives like it err by at most 1 % of their path"
+        )
     if (found := verdict(metrics)) is not None and found.doubts:
         typer.echo(f"doubts: {'; '.join(found.doubts)}")
     for note in metrics.unit_notes():

@@ -26,8 +26,10 @@ IMPORTED = {
 }
 LOOKED_UP = ("torch", "lightning", "evo")  # to import them takes up to five seconds
 WEIGHTS = ("default", "sim", "erf-dfc", "erf-dfcv2")
+# no fault
 NO_DATA_SET = (
-    f"missing  a data set: set ${KITTI_VARIABLE} or give --dataset (the simulated street needs none)"  # no fault
+    f"missing  a data set: set ${KITTI_VARIABLE} or give --dataset "
+    "(the simulated street needs none)"
 )
 
 
@@ -35,13 +37,18 @@ def examine(dataset: Path | None, camera: Path | None = None) -> list[str]:
     """Check the installation and a data set, else ``$KITTI_ODOMETRY``; lines begin with ``ok`` or ``missing``."""
     lines = [f"ok       python {platform.python_version()} on {platform.machine()}"]
     reinstall = "; run make setup, or pip install --force-reinstall {}"
-    lines += [_checked(name, partial(_package, name), reinstall.format(name)) for name in (*LOOKED_UP, *IMPORTED)]
+    lines += [
+        _checked(name, partial(_package, name), reinstall.format(name))
+        for name in (*LOOKED_UP, *IMPORTED)
+    ]
     lines.append(_checked("open3d", lambda: f" {import_open3d().__version__}"))
     lines += [_checked(f"weights {name}", partial(_weights, name)) for name in WEIGHTS]
     variable = os.environ.get(KITTI_VARIABLE)
     root = dataset or (Path(variable) if variable else None)
     if root is None:
-        no_camera = [] if camera is None else [f"missing  the data set of camera {camera}: give --dataset"]
+        no_camera = (
+            [] if camera is None else [f"missing  the data set of camera {camera}: give --dataset"]
+        )
         return [*lines, *no_camera, NO_DATA_SET]
     try:
         kinds = sequence_kinds(root)
@@ -50,7 +57,9 @@ def examine(dataset: Path | None, camera: Path | None = None) -> list[str]:
     if not kinds:
         lines.append(f"missing  {root} is not a data set of a kind that docs/recordings.md lists")
     for name, kind in kinds.items():
-        lines.append(_checked(f"sequence {name}", partial(_sequence, root, name, kind, camera), f" ({kind})"))
+        lines.append(
+            _checked(f"sequence {name}", partial(_sequence, root, name, kind, camera), f" ({kind})")
+        )
     return lines
 
 
@@ -78,7 +87,11 @@ def _sequence(root: Path, name: str, kind: str, camera: Path | None) -> str:
     truth, beside = "true poses", poses_beside(root)
     if sequence.reference is None:
         truth = "no true poses" + ("" if beside is None else f" (--truth {beside} gives some)")
-    height = f"camera {sequence.camera_height_m:.2f} m high" if sequence.camera_height_m else "camera height unknown"
+    height = (
+        f"camera {sequence.camera_height_m:.2f} m high"
+        if sequence.camera_height_m
+        else "camera height unknown"
+    )
     scans = sum(sequence.has_scan(k) for k in range(len(sequence)))
     size = f"{sequence.intrinsics.width}x{sequence.intrinsics.height}"
     return f": {len(sequence)} frames of {size}, {truth}, {height}, {scans} LiDAR scans ({kind})"

@@ -25,7 +25,11 @@ SERVER = "https://s3.eu-central-1.amazonaws.com/avg-kitti"
 _WITH_POSES = 11  # sequences 00 to 10
 _SEQUENCES = 22
 _COLOUR, _GREY = ("data_odometry_color.zip", "image_2"), ("data_odometry_gray.zip", "image_0")
-_CALIBRATION, _POSES, _SCANS = "data_odometry_calib.zip", "data_odometry_poses.zip", "data_odometry_velodyne.zip"
+_CALIBRATION, _POSES, _SCANS = (
+    "data_odometry_calib.zip",
+    "data_odometry_poses.zip",
+    "data_odometry_velodyne.zip",
+)
 _NAME = re.compile(r"\d\d")
 _CHUNK = 1 << 20
 _TIMEOUT_S = 30.0
@@ -50,7 +54,9 @@ def download_kitti(
         raise SlamError(f"KITTI odometry has no sequence {sequence}: give 00 to {_SEQUENCES - 1}")
     archive, camera = _GREY if is_grey else _COLOUR
     home = f"dataset/sequences/{sequence}"
-    wanted: list[tuple[str, tuple[str, ...]]] = [(_CALIBRATION, (f"{home}/calib.txt", f"{home}/times.txt"))]
+    wanted: list[tuple[str, tuple[str, ...]]] = [
+        (_CALIBRATION, (f"{home}/calib.txt", f"{home}/times.txt"))
+    ]
     if int(sequence) < _WITH_POSES:
         wanted.append((_POSES, (f"dataset/poses/{sequence}.txt",)))
     wanted.append((archive, (f"{home}/{camera}/",)))
@@ -58,13 +64,19 @@ def download_kitti(
         wanted.append((_SCANS, (f"{home}/velodyne/",)))
     sources = [_RemoteZip(f"{server.rstrip('/')}/{name}") for name, _ in wanted]
     parts = [
-        (source, member) for source, (_, prefixes) in zip(sources, wanted) for member in source.matching(*prefixes)
+        (source, member)
+        for source, (_, prefixes) in zip(sources, wanted)
+        for member in source.matching(*prefixes)
     ]
     folder.mkdir(parents=True, exist_ok=True)
-    missing = sum(member.file_size for _, member in parts if not (folder / member.filename).is_file())
+    missing = sum(
+        member.file_size for _, member in parts if not (folder / member.filename).is_file()
+    )
     free = shutil.disk_usage(folder).free
     if missing > free:
-        raise SlamError(f"{folder} has {free / 1e9:.1f} GB free, {missing / 1e9:.1f} GB are needed: give another --to")
+        raise SlamError(
+            f"{folder} has {free / 1e9:.1f} GB free, {missing / 1e9:.1f} GB are needed: give another --to"
+        )
     for done, (source, member) in enumerate(parts, 1):
         source.fetch(member, folder)
         progress("files", done, len(parts))
@@ -80,13 +92,21 @@ class _RemoteZip:
 
     def matching(self, *prefixes: str) -> list[zipfile.ZipInfo]:
         """Files whose names begin with one of the prefixes, in the order in which they are stored."""
-        members = [m for m in self._archive.infolist() if m.filename.startswith(prefixes) and not m.is_dir()]
+        members = [
+            m
+            for m in self._archive.infolist()
+            if m.filename.startswith(prefixes) and not m.is_dir()
+        ]
         if not members:
-            raise SlamError(f"{self.url} has no {' or '.join(prefixes)}: check the name of the sequence")
+            raise SlamError(
+                f"{self.url} has no {' or '.join(prefixes)}: check the name of the sequence"
+            )
         for member in members:
             path = PurePosixPath(member.filename)
             if path.is_absolute() or ".." in path.parts or "\\" in member.filename:
-                raise SlamError(f"{self.url} has a member {member.filename!r} outside of its folder: not unpacked")
+                raise SlamError(
+                    f"{self.url} has a member {member.filename!r} outside of its folder: not unpacked"
+                )
         return sorted(members, key=lambda member: member.header_offset)
 
     def fetch(self, member: zipfile.ZipInfo, folder: Path) -> None:
@@ -116,19 +136,34 @@ class _RemoteZip:
                     f"{self.url}: the server gives no parts of files (HTTP ranges): fetch the whole file there"
                 ) from error
             except (zipfile.BadZipFile, ValueError) as error:
-                raise SlamError(f"{self.url} is no zip archive ({error}): check the address") from error
+                raise SlamError(
+                    f"{self.url} is no zip archive ({error}): check the address"
+                ) from error
 
     @contextmanager
     def _errors(self, what: str) -> Iterator[None]:
         """Raise what a broken connection or a damaged file leads to as one line."""
         remotezip, _, urllib3 = import_extra("download")
-        broken = (OSError, EOFError, remotezip.RemoteZipError, urllib3.HTTPError, zipfile.BadZipFile, zlib.error)
+        broken = (
+            OSError,
+            EOFError,
+            remotezip.RemoteZipError,
+            urllib3.HTTPError,
+            zipfile.BadZipFile,
+            zlib.error,
+        )
         try:
             yield
         except broken as error:
-            if isinstance(error.__context__, ValueError):  # what requests says of an address without server
-                raise SlamError(f"{self.url} is no address: give --mirror as https://HOST/FOLDER") from error
-            raise SlamError(f"{self.url}: {what} ({_cause(error)}); run the same command again to go on") from error
+            if isinstance(
+                error.__context__, ValueError
+            ):  # what requests says of an address without server
+                raise SlamError(
+                    f"{self.url} is no address: give --mirror as https://HOST/FOLDER"
+                ) from error
+            raise SlamError(
+                f"{self.url}: {what} ({_cause(error)}); run the same command again to go on"
+            ) from error
 
 
 def _cause(error: BaseException) -> str:

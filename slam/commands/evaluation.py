@@ -60,7 +60,9 @@ def of_runs(paths: Sequence[Path], as_json: bool) -> None:
         tables.runs_table(runs).print()
 
 
-def of_two(estimate: Path, reference: Path, format: str, limits: Sequence[str], as_json: bool) -> None:
+def of_two(
+    estimate: Path, reference: Path, format: str, limits: Sequence[str], as_json: bool
+) -> None:
     """One trajectory against another under every alignment, with the commands of evo that give the same.
 
     Raises:
@@ -74,7 +76,10 @@ def of_two(estimate: Path, reference: Path, format: str, limits: Sequence[str], 
         both = {estimate: "optimised", reference: REFERENCE}
         timed = all(trajectory_at(path, format, name).timed for path, name in both.items())
         kind = "tum" if timed else "kitti"
-        files = [path / trajectory_file(name, kind) if path.is_dir() else path for path, name in both.items()]
+        files = [
+            path / trajectory_file(name, kind) if path.is_dir() else path
+            for path, name in both.items()
+        ]
         typer.echo("\n".join(evo_commands(files[0], files[-1], format)))
     if broken := exceeded(run.errors, limits):
         raise SlamError("; ".join(broken))
@@ -91,7 +96,11 @@ class SystemRun:
 
     def tree(self) -> dict[str, Any]:
         """For JSON: the system, the file, the number of compared poses, and T of ``metrics.json``."""
-        return {"system": self.system, "path": str(self.path), "poses": self.poses} | self.errors.tree()
+        return {
+            "system": self.system,
+            "path": str(self.path),
+            "poses": self.poses,
+        } | self.errors.tree()
 
 
 def named_paths(words: Sequence[str]) -> list[tuple[str, Path]]:
@@ -127,7 +136,10 @@ def trajectory_at(path: Path, format: str = "auto", of_run: str = "optimised") -
 
 
 def compare(
-    paths: Sequence[tuple[str, Path]], reference: Path, format: str = "auto", frames: str | None = None
+    paths: Sequence[tuple[str, Path]],
+    reference: Path,
+    format: str = "auto",
+    frames: str | None = None,
 ) -> list[SystemRun]:
     """Errors of trajectories against one reference.
 
@@ -167,7 +179,9 @@ def _rows(runs: Sequence[SystemRun]) -> Iterator[list[str]]:
 
 def _spread(column: tables.ErrorColumn, runs: Sequence[SystemRun]) -> str:
     """The number of one run; of several the mean and the deviation of those that have it."""
-    values = [value for value in (run.errors.at(column.path)[0] for run in runs) if value is not None]
+    values = [
+        value for value in (run.errors.at(column.path)[0] for run in runs) if value is not None
+    ]
     if len(values) < 2:
         return tables.written(values[0] if values else None, column.decimals)
     mean, deviation = float(np.mean(values)), float(np.std(values, ddof=1))

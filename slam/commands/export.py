@@ -45,7 +45,13 @@ POINTS, TRANSFORMS = "points.ply", "transforms.json"
 _IMAGES = "images"
 _MADE_BY = {"made_by": "erfsfm-slam"}
 _MAPS = {"mesh": MAP_MESH, "cloud": MAP_CLOUD}
-_SUFFIXES = {"mesh": (".ply",), "cloud": (".ply",), "occupancy": (".yaml", ".pgm"), "colmap": (), "nerfstudio": ()}
+_SUFFIXES = {
+    "mesh": (".ply",),
+    "cloud": (".ply",),
+    "occupancy": (".yaml", ".pgm"),
+    "colmap": (),
+    "nerfstudio": (),
+}
 _SCENES = {  # files, and what one of them holds if it is ours
     "colmap": ((_IMAGES, BINARY_FOLDER, *MODEL_FILES), HEADER),
     "nerfstudio": ((_IMAGES, POINTS, TRANSFORMS), json.dumps(_MADE_BY)[1:-1]),
@@ -69,7 +75,9 @@ _SAMPLES_A_CELL = 4.0
 _CHUNK = 250_000  # triangles at a time
 _MOST_CELLS = 64_000_000
 _BORDER_DECIMALS = 6
-_EVENLY = np.array([0.7548776662466927, 0.5698402909980532])  # steps of Roberts' R2 sequence, which fills a square
+_EVENLY = np.array(
+    [0.7548776662466927, 0.5698402909980532]
+)  # steps of Roberts' R2 sequence, which fills a square
 
 # of its ground, in camera heights
 _ANCHOR_STEP = 0.6
@@ -80,7 +88,9 @@ _REACH = 12.0
 _MIN_POINTS = 30
 _LEAST_SQUARES_ROUNDS = 6
 _TUKEY = 0.12
-_TILT_PRIOR = 0.05  # weight of the camera's own tilt, against one of a point at the edge of the neighbourhood
+_TILT_PRIOR = (
+    0.05  # weight of the camera's own tilt, against one of a point at the edge of the neighbourhood
+)
 _NEIGHBOURS = 6
 
 
@@ -116,7 +126,9 @@ def export(
     """
     for name, value in {"resolution": resolution, "dataset": dataset, "points": points}.items():
         if value is not None and what not in _TAKERS[name]:
-            raise RunError(f"--{name} does nothing for {what}: it is for {' and '.join(_TAKERS[name])}")
+            raise RunError(
+                f"--{name} does nothing for {what}: it is for {' and '.join(_TAKERS[name])}"
+            )
     _check_target(what, output)
     if what in _MAPS:
         write_ply(output, _map(folder, what, up))
@@ -126,12 +138,19 @@ def export(
         trajectory = _trajectory(folder, up)
         cloud = _map(folder, "cloud", up) if (folder.path / MAP_CLOUD).is_file() else None
         without = _interpolated(folder)
-        has_images = what == "nerfstudio" or dataset is not None or folder.metrics().provenance.recording is not None
+        has_images = (
+            what == "nerfstudio"
+            or dataset is not None
+            or folder.metrics().provenance.recording is not None
+        )
         if has_images:
             camera, written = _write_images(folder, output, trajectory, dataset, progress)
             without = set(range(len(trajectory))) - set(written)
         else:
-            logger.warning("%s does not record where its images are: the model has none; give --dataset", folder.path)
+            logger.warning(
+                "%s does not record where its images are: the model has none; give --dataset",
+                folder.path,
+            )
         if what == "colmap":
             places = Places.read(folder.require(PLACES))
             model = _model_points(places, R_UP_WORLDS[up], cloud, points)
@@ -147,11 +166,15 @@ def _check_target(what: str, output: Path) -> None:
     if not suffixes and output.exists() and not output.is_dir():
         raise RunError(f"{output} is a file: {what} is several files, give the name of a folder")
     if suffixes and output.suffix.lower() not in suffixes:
-        raise RunError(f"{what} is written as {' or '.join(suffixes)}; got '{output.name}', give a name that ends so")
+        raise RunError(
+            f"{what} is written as {' or '.join(suffixes)}; got '{output.name}', give a name that ends so"
+        )
     if what in _MAPS:
         check_replaced(output, b"ply")
     elif what == "occupancy":
-        refuse_foreign([output.with_suffix(suffix) for suffix in suffixes], "occupied_thresh:", RunError)
+        refuse_foreign(
+            [output.with_suffix(suffix) for suffix in suffixes], "occupied_thresh:", RunError
+        )
     else:
         names, mark = _SCENES[what]
         refuse_foreign([output / name for name in names], mark, RunError)
@@ -160,7 +183,9 @@ def _check_target(what: str, output: Path) -> None:
 def _export_occupancy(folder: RunFolder, output: Path, resolution: float) -> Path:
     unit = folder.metrics().unit
     if unit not in (METRES, CAMERA_HEIGHTS):
-        raise RunError(f"heights above the road need metres or camera heights, but this run's lengths are in {unit}")
+        raise RunError(
+            f"heights above the road need metres or camera heights, but this run's lengths are in {unit}"
+        )
     mesh, trajectory = _map(folder, "mesh", "z"), _trajectory(folder, "z")
     cells, corner = occupancy_grid(mesh, trajectory.T_world_camera, resolution, unit == METRES)
     written = output.with_suffix(".yaml")
@@ -181,8 +206,13 @@ def _trajectory(folder: RunFolder, up: str) -> Trajectory:
     trajectory = read_trajectory(folder.require(ESTIMATE), "tum")
     frames = folder.metrics().sequence.frames
     if frames is not None and frames != len(trajectory):
-        raise RunError(f"{folder.path}: {ESTIMATE} is damaged: it has {len(trajectory)} rows for {frames} frames")
-    return replace(trajectory, T_world_camera=se3.make(R_UP_WORLDS[up], np.zeros(3)) @ trajectory.T_world_camera)
+        raise RunError(
+            f"{folder.path}: {ESTIMATE} is damaged: it has {len(trajectory)} rows for {frames} frames"
+        )
+    return replace(
+        trajectory,
+        T_world_camera=se3.make(R_UP_WORLDS[up], np.zeros(3)) @ trajectory.T_world_camera,
+    )
 
 
 def _model_points(
@@ -198,7 +228,9 @@ def _model_points(
         tracks = structure.tracks()
         length = np.bincount(tracks.point, minlength=len(tracks.points))
         is_known = np.isfinite(tracks.points).all(axis=1)
-        chosen = np.argsort(np.where(is_known, -length, 1), kind="stable")[: int(is_known.sum())][:at_most]
+        chosen = np.argsort(np.where(is_known, -length, 1), kind="stable")[: int(is_known.sum())][
+            :at_most
+        ]
         number = np.full(len(tracks.points), -1)
         number[chosen] = np.arange(len(chosen))
         kept = number[tracks.point] >= 0
@@ -211,7 +243,11 @@ def _model_points(
     if cloud is not None:
         if len(points):
             colours = cloud.colours[cKDTree(cloud.points).query(points)[1]]
-        count = len(cloud.points) if at_most is None else min(max(at_most - len(points), 0), len(cloud.points))
+        count = (
+            len(cloud.points)
+            if at_most is None
+            else min(max(at_most - len(points), 0), len(cloud.points))
+        )
         rows = np.linspace(0, len(cloud.points) - 1, count).round().astype(np.intp)
         points = np.concatenate([points, cloud.points[rows]])
         colours = np.concatenate([colours, cloud.colours[rows]])
@@ -240,13 +276,19 @@ def _write_scene(
         write_ply(output / POINTS, cloud)
         scene["ply_file_path"] = POINTS
     poses = {k: (trajectory.T_world_camera[k] @ _T_CAMERA_OPENGL).tolist() for k in frames}
-    scene["frames"] = [{"file_path": _image_name(k), "transform_matrix": pose} for k, pose in poses.items()]
+    scene["frames"] = [
+        {"file_path": _image_name(k), "transform_matrix": pose} for k, pose in poses.items()
+    ]
     text = json.dumps(scene, indent=2, allow_nan=False) + "\n"
     write_atomically(output / TRANSFORMS, text, RunError)
 
 
 def _write_images(
-    folder: RunFolder, output: Path, trajectory: Trajectory, dataset: Path | None, progress: Progress
+    folder: RunFolder,
+    output: Path,
+    trajectory: Trajectory,
+    dataset: Path | None,
+    progress: Progress,
 ) -> tuple[Intrinsics, list[int]]:
     """Write ``images/NNNNNN.png`` of all frames with a usable image; they are returned, with their camera."""
     sequence, rows = _recording(folder, trajectory, dataset)
@@ -265,7 +307,9 @@ def _write_images(
     if not written:
         raise RunError(f"no image of {folder.path} can be read: check the data set")
     if len(written) < len(rows):
-        logger.warning("%d of %d frames have no usable image: left out", len(rows) - len(written), len(rows))
+        logger.warning(
+            "%d of %d frames have no usable image: left out", len(rows) - len(written), len(rows)
+        )
     return sequence.intrinsics, written
 
 
@@ -274,14 +318,22 @@ def _image_name(frame: int) -> str:
     return f"{_IMAGES}/{frame:06d}.png"
 
 
-def _recording(folder: RunFolder, trajectory: Trajectory, dataset: Path | None) -> tuple[Sequence, list[int | None]]:
+def _recording(
+    folder: RunFolder, trajectory: Trajectory, dataset: Path | None
+) -> tuple[Sequence, list[int | None]]:
     """The recording of a run, and which frame of it, by its stamp, each row of the trajectory is."""
     recorded = folder.metrics().provenance.recording
     if recorded is None and dataset is None:
         raise RunError(f"{folder.path} does not record where its images are: give --dataset ROOT")
     recorded = recorded or {}
-    place, camera = (Path(recorded[name]) if name in recorded else None for name in ("dataset", "camera"))
-    if dataset is not None and camera is not None and not (camera.exists() or is_field_of_view(camera)):
+    place, camera = (
+        Path(recorded[name]) if name in recorded else None for name in ("dataset", "camera")
+    )
+    if (
+        dataset is not None
+        and camera is not None
+        and not (camera.exists() or is_field_of_view(camera))
+    ):
         camera = None  # it may have moved with the images
     try:
         sequence = open_sequence(dataset or place, recorded.get("sequence"), camera)
@@ -290,20 +342,30 @@ def _recording(folder: RunFolder, trajectory: Trajectory, dataset: Path | None) 
             f"the images of {folder.path} are needed and not found ({error}); give --dataset ROOT"
         ) from error
     own = Places.read(folder.require(PLACES)).intrinsics
-    expected, found = ((c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in (own, sequence.intrinsics))
+    expected, found = (
+        (c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in (own, sequence.intrinsics)
+    )
     if not np.allclose(expected, found, atol=_SAME_PIXEL):
-        raise RunError(f"{sequence.name} has another camera than {folder.path}: give the data set of the run")
+        raise RunError(
+            f"{sequence.name} has another camera than {folder.path}: give the data set of the run"
+        )
     stamps = np.asarray(sequence.stamps)
     nearest = nearest_stamps(trajectory.stamps, stamps)
     same = np.abs(stamps[nearest] - trajectory.stamps) < _SAME_STAMP_S
     if not same.any():
-        raise RunError(f"{sequence.name} has no frame at the times of {folder.path}: give the data set of the run")
-    return sequence, [row if is_same else None for row, is_same in zip(nearest.tolist(), same, strict=True)]
+        raise RunError(
+            f"{sequence.name} has no frame at the times of {folder.path}: give the data set of the run"
+        )
+    return sequence, [
+        row if is_same else None for row, is_same in zip(nearest.tolist(), same, strict=True)
+    ]
 
 
 def _interpolated(folder: RunFolder) -> set[int]:
     """Frames of a run without a usable image."""
-    return {k for gap in folder.metrics().sequence.bridged or () for k in range(gap.first, gap.last + 1)}
+    return {
+        k for gap in folder.metrics().sequence.bridged or () for k in range(gap.first, gap.last + 1)
+    }
 
 
 @dataclass(frozen=True)
@@ -318,7 +380,10 @@ class Ground:
         """Height of the ground ``(P,)`` under places ``(P, 2)``; NaN far from the drive."""
         count = min(_NEIGHBOURS, len(self.anchors))
         distances, nearest = cKDTree(self.anchors[:, :2]).query(places, k=count)
-        distances, nearest = distances.reshape(len(places), count), nearest.reshape(len(places), count)
+        distances, nearest = (
+            distances.reshape(len(places), count),
+            nearest.reshape(len(places), count),
+        )
         offsets = places[:, None] - self.anchors[nearest, :2]
         planes = self.anchors[nearest, 2] + (self.slopes[nearest] * offsets).sum(axis=2)
         # neighbours count by their distance beyond the nearest, so that planes go over into each other
@@ -364,7 +429,9 @@ class Grid:
     def centres(self, cells: NDArray[np.int64]) -> FloatArray:
         """Centres ``(C, 2)`` of cells by their flat numbers."""
         row, column = np.divmod(cells, self.width)
-        return np.asarray((self.first + 0.5 + np.stack([column, row], axis=1)) * self.resolution, np.float64)
+        return np.asarray(
+            (self.first + 0.5 + np.stack([column, row], axis=1)) * self.resolution, np.float64
+        )
 
 
 def occupancy_grid(
@@ -413,12 +480,21 @@ def samples(mesh: Ply, resolution: float) -> Iterator[tuple[FloatArray, FloatArr
         edges = corners[:, 1:] - corners[:, :1]
         areas = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
         counts = np.ceil(_SAMPLES_A_CELL * areas / resolution**2).astype(np.int64)
-        for part in np.array_split(np.arange(len(counts)), max(int(counts.sum()) // (4 * _CHUNK), 1)):
+        for part in np.array_split(
+            np.arange(len(counts)), max(int(counts.sum()) // (4 * _CHUNK), 1)
+        ):
             rows = np.repeat(part, counts[part])
-            within = np.arange(len(rows)) - np.repeat(np.cumsum(counts[part]) - counts[part], counts[part])
+            within = np.arange(len(rows)) - np.repeat(
+                np.cumsum(counts[part]) - counts[part], counts[part]
+            )
             uv = (0.5 + within[:, None] * _EVENLY) % 1.0
-            uv = np.where(uv.sum(axis=1, keepdims=True) > 1.0, 1.0 - uv, uv)  # the other half of the square
-            yield corners[rows, 0] + (uv[:, :, None] * edges[rows]).sum(axis=1), areas[rows] / counts[rows]
+            uv = np.where(
+                uv.sum(axis=1, keepdims=True) > 1.0, 1.0 - uv, uv
+            )  # the other half of the square
+            yield (
+                corners[rows, 0] + (uv[:, :, None] * edges[rows]).sum(axis=1),
+                areas[rows] / counts[rows],
+            )
 
 
 def ground_along(points: FloatArray, T_world_camera: FloatArray, camera_height: float) -> Ground:
@@ -430,7 +506,9 @@ def ground_along(points: FloatArray, T_world_camera: FloatArray, camera_height: 
     cameras, up = T_world_camera[chosen, :3, 3], -T_world_camera[chosen, :3, 1]
     tree = cKDTree(points[:, :2])
 
-    def around() -> Iterator[tuple[FloatArray, FloatArray]]:  # twice: all at once take 0.7 GB a kilometre
+    def around() -> Iterator[
+        tuple[FloatArray, FloatArray]
+    ]:  # twice: all at once take 0.7 GB a kilometre
         for camera, axis in zip(cameras, up, strict=True):
             near = points[tree.query_ball_point(camera[:2], _RADIUS * camera_height)]
             yield near, -((near - camera) @ axis)
@@ -439,29 +517,45 @@ def ground_along(points: FloatArray, T_world_camera: FloatArray, camera_height: 
     found = (depth[(depth > limits[0]) & (depth < limits[1])] for _, depth in around())
     medians = [float(np.median(depth)) for depth in found if len(depth) >= _MIN_POINTS]
     if not medians:
-        raise RunError("the map has no ground below the cameras, so free and occupied cannot be told apart")
+        raise RunError(
+            "the map has no ground below the cameras, so free and occupied cannot be told apart"
+        )
     height = float(np.median(medians))
     planes = [
-        _plane(near[np.abs(depth - height) < _BAND * height], camera - height * axis, -axis[:2] / axis[2], height)
+        _plane(
+            near[np.abs(depth - height) < _BAND * height],
+            camera - height * axis,
+            -axis[:2] / axis[2],
+            height,
+        )
         for (near, depth), camera, axis in zip(around(), cameras, up, strict=True)
     ]
     anchors, slopes = map(np.array, zip(*planes))
     return Ground(anchors, slopes, _REACH * height)
 
 
-def write_ros_map(path: Path, cells: NDArray[np.uint8], corner: FloatArray, resolution: float, unit: str) -> None:
+def write_ros_map(
+    path: Path, cells: NDArray[np.uint8], corner: FloatArray, resolution: float, unit: str
+) -> None:
     """Write a grid as `occupancy_grid` gives it: ``<name>.pgm`` and, after it, ``<name>.yaml``, each atomically.
 
     ``map_server`` takes lengths for metres, whatever their ``unit`` is: a comment says so.
     """
     image = path.with_suffix(".pgm")
     write_atomically(image, cv2.imencode(".pgm", cells)[1].tobytes(), RunError)
-    description = {"image": image.name, "resolution": resolution, "origin": [*corner.tolist(), 0.0], "negate": 0}
+    description = {
+        "image": image.name,
+        "resolution": resolution,
+        "origin": [*corner.tolist(), 0.0],
+        "negate": 0,
+    }
     text = yaml.safe_dump(description | _THRESHOLDS, sort_keys=False, default_flow_style=None)
     write_atomically(path, f"# lengths in {unit}\n{text}", RunError)
 
 
-def _plane(points: FloatArray, start: FloatArray, tilt: FloatArray, height: float) -> tuple[FloatArray, FloatArray]:
+def _plane(
+    points: FloatArray, start: FloatArray, tilt: FloatArray, height: float
+) -> tuple[FloatArray, FloatArray]:
     """A robust plane through points, near the one through ``start`` with slope ``tilt``: its point and slope."""
     if len(points) < _MIN_POINTS:
         return start, tilt

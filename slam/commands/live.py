@@ -47,7 +47,13 @@ from slam.prediction.assembly import open_prediction
 from slam.results.folder import RunFolder, check_output, run_log
 from slam.runtime.errors import SequenceError, SlamError
 from slam.runtime.imports import import_extra
-from slam.sequences.camera_file import DEFAULT_FPS, as_known, find_camera_file, require_size, undistorted
+from slam.sequences.camera_file import (
+    DEFAULT_FPS,
+    as_known,
+    find_camera_file,
+    require_size,
+    undistorted,
+)
 from slam.sequences.recording import GrowingSequence
 
 logger = logging.getLogger(__name__)
@@ -91,11 +97,15 @@ def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
         source = open_source(request.dataset, request.wait)
         path = Path(request.dataset).absolute()
         folders = (path, path.parent) if path.exists() else ()
-        camera = find_camera_file(request.camera, *folders, wanted_by=request.dataset, images=source, fps=source.fps)
+        camera = find_camera_file(
+            request.camera, *folders, wanted_by=request.dataset, images=source, fps=source.fps
+        )
         source.fps, name = camera.fps, Path(request.dataset).stem or "live"
         sequence = StreamedSequence(name, source, camera, request.wait, request.every_frame)
         sequence.intrinsics = as_known(sequence.intrinsics, request.camera)
-        prediction = open_prediction(request.weights, request.device, settings.depth, sequence.intrinsics)
+        prediction = open_prediction(
+            request.weights, request.device, settings.depth, sequence.intrinsics
+        )
         pipeline = SlamPipeline(sequence, prediction.predictor, settings, seed=request.seed)
         pipeline.require_possible()
         blank = np.zeros((sequence.intrinsics.height, sequence.intrinsics.width, 3), np.uint8)
@@ -103,14 +113,24 @@ def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
         prediction.networks.poses([blank] * (prediction.networks.sources + 1))
         viewer = Viewer(sequence.intrinsics) if request.view else None
         folder = RunFolder.create(request.output, Path(settings.output.root), name, lock)
-        recorder = LiveRecorder(folder, pipeline, settings, provenance_of(request, prediction, sequence))
+        recorder = LiveRecorder(
+            folder, pipeline, settings, provenance_of(request, prediction, sequence)
+        )
         poses = LivePoses(prediction.networks.sources, sequence.camera_height_m, settings)
         recorder.follow(sequence, poses, emit, viewer)
         try:
             # in a thread: the sequence's lock may be held by the code that is interrupted
-            record(recorder, log, ignore_signals, sequence.frames(), lambda: Thread(target=sequence.stop).start())
+            record(
+                recorder,
+                log,
+                ignore_signals,
+                sequence.frames(),
+                lambda: Thread(target=sequence.stop).start(),
+            )
         except SlamError as error:
-            raise SlamError(f"{error}{_DROPPED.format(sequence.dropped) if sequence.dropped else ''}") from error
+            raise SlamError(
+                f"{error}{_DROPPED.format(sequence.dropped) if sequence.dropped else ''}"
+            ) from error
         finally:
             sequence.close()
     return folder
@@ -127,7 +147,12 @@ class StreamedSequence(GrowingSequence):
     """
 
     def __init__(
-        self, name: str, source: Source, camera: CameraFile, most_wait_s: float, every_frame: bool = False
+        self,
+        name: str,
+        source: Source,
+        camera: CameraFile,
+        most_wait_s: float,
+        every_frame: bool = False,
     ) -> None:
         """``source`` is read from the first frame on until it sends nothing for ``most_wait_s``.
 
@@ -135,7 +160,9 @@ class StreamedSequence(GrowingSequence):
         """
         require_size(source, camera, name)
         if every_frame and not source.is_stored:
-            raise SequenceError(f"{name} does not wait while an image is measured: leave out --every-frame")
+            raise SequenceError(
+                f"{name} does not wait while an image is measured: leave out --every-frame"
+            )
         intrinsics, self._undistortion = undistorted(camera)
         super().__init__(intrinsics, camera.height_or(None), name)
         self.arrived_s: dict[int, float] = {}
@@ -153,7 +180,9 @@ class StreamedSequence(GrowingSequence):
             image = image if self._undistortion is None else self._undistortion.apply(image)
             image.setflags(write=False)
             self.stamps = np.append(self.stamps, stamp)
-            self.arrived_s = {k: v for k, v in self.arrived_s.items() if k >= index - 2} | {index: at_s}
+            self.arrived_s = {k: v for k, v in self.arrived_s.items() if k >= index - 2} | {
+                index: at_s
+            }
             yield Frame(index, stamp, image)
 
     def stop(self) -> None:
@@ -203,7 +232,9 @@ class StreamedSequence(GrowingSequence):
 class LiveRecorder(FolderRecorder):
     """Also says where the camera is while frames come, and how it ended."""
 
-    def follow(self, sequence: StreamedSequence, poses: LivePoses, emit: Emit, viewer: Viewer | None) -> None:
+    def follow(
+        self, sequence: StreamedSequence, poses: LivePoses, emit: Emit, viewer: Viewer | None
+    ) -> None:
         """Say the poses of a sequence that grows."""
         self._sequence, self._poses, self._emit, self._viewer = sequence, poses, emit, viewer
         self._said = 0
@@ -222,9 +253,20 @@ class LiveRecorder(FolderRecorder):
             index, self._said = self._said, self._said + 1
             at_s = sequence.arrived_s.get(index)
             support = None if newest.support is None else round(newest.support, 2)
-            message: dict[str, Any] = {"type": "pose", "frame": index, "stamp": float(sequence.stamps[index])}
-            message |= {"state": newest.state, "unit": self._poses.unit_name, "scale": newest.unit, "support": support}
-            message |= {"T_world_camera": newest.T_world_camera[:3].ravel().tolist()}  # row by row as in KITTI's files
+            message: dict[str, Any] = {
+                "type": "pose",
+                "frame": index,
+                "stamp": float(sequence.stamps[index]),
+            }
+            message |= {
+                "state": newest.state,
+                "unit": self._poses.unit_name,
+                "scale": newest.unit,
+                "support": support,
+            }
+            message |= {
+                "T_world_camera": newest.T_world_camera[:3].ravel().tolist()
+            }  # row by row as in KITTI's files
             late_ms = None if at_s is None else round(1e3 * (time.monotonic() - at_s), 1)
             self._emit(message | {"latency_ms": late_ms, "dropped": sequence.dropped})
             if self._viewer is not None:
@@ -233,7 +275,11 @@ class LiveRecorder(FolderRecorder):
     def estimate(self, estimate: Estimate) -> None:
         """Also say all poses again as the whole drive gives them, and why it ended."""
         super().estimate(estimate)
-        sequence, trajectory, loops = self._sequence, estimate.optimised, len(estimate.loops.accepted)
+        sequence, trajectory, loops = (
+            self._sequence,
+            estimate.optimised,
+            len(estimate.loops.accepted),
+        )
         state = "loop closed" if loops else "whole drive"
         message: dict[str, Any] = {"type": "trajectory", "state": state, "loops": loops}
         message |= {"unit": estimate.scale.unit_name, "run": str(self.folder.path)}
@@ -242,7 +288,9 @@ class LiveRecorder(FolderRecorder):
         self._emit(message | {"dropped": sequence.dropped, "ended": sequence.ended})
         if self._viewer is not None:
             self._viewer.correct(trajectory)
-        (logger.warning if sequence.dropped else logger.info)("%d images were dropped", sequence.dropped)
+        (logger.warning if sequence.dropped else logger.info)(
+            "%d images were dropped", sequence.dropped
+        )
         is_expected = sequence.ended in (_INTERRUPTED, _OVER)
         (logger.info if is_expected else logger.warning)("the stream ended: %s", sequence.ended)
 
@@ -271,7 +319,9 @@ class Viewer:
         rr, stream, T = self._rr, self._stream, newest.T_world_camera
         stream.set_time("frame", sequence=index)
         self._positions.append(T[:3, 3])
-        stream.log("world/path", rr.LineStrips3D([np.array(self._positions[-2000:])], colors=[_PATH]))
+        stream.log(
+            "world/path", rr.LineStrips3D([np.array(self._positions[-2000:])], colors=[_PATH])
+        )
         stream.log("world/camera", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
         keyframe = drive.keyframes[-1] if drive.keyframes else None
         if keyframe is None or index - keyframe.index > 1 or newest.unit is None:
@@ -291,7 +341,9 @@ class Viewer:
 
     def correct(self, trajectory: Trajectory) -> None:
         """The path of the whole drive, with its loops closed."""
-        self._stream.log("world/path", self._rr.LineStrips3D([trajectory.positions], colors=[(20, 160, 60)]))
+        self._stream.log(
+            "world/path", self._rr.LineStrips3D([trajectory.positions], colors=[(20, 160, 60)])
+        )
         self._stream.flush()
 
 
@@ -309,7 +361,9 @@ class FolderSource:
         while (size := self._first_size()) is None:
             if time.monotonic() > deadline:
                 suffixes = ", ".join(IMAGE_SUFFIXES)
-                raise SequenceError(f"no image came to {folder} within {wait_s:g} s: looked for {suffixes}")
+                raise SequenceError(
+                    f"no image came to {folder} within {wait_s:g} s: looked for {suffixes}"
+                )
             time.sleep(_POLL_S)
         self.height, self.width = size
 
@@ -322,7 +376,11 @@ class FolderSource:
                 if stopped.is_set():
                     return
                 if natural_key(path) < natural_key(last):
-                    logger.warning("%s came after %s, before which its name belongs; it is left out", path, last.name)
+                    logger.warning(
+                        "%s came after %s, before which its name belongs; it is left out",
+                        path,
+                        last.name,
+                    )
                 else:
                     image = self._usable(path)
                     if image is not None:
@@ -351,7 +409,14 @@ class FolderSource:
         height, width = image.shape[:2]
         if (height, width) == (self.height, self.width):
             return image
-        logger.warning("%s is %d x %d, not %d x %d; it is left out", path, width, height, self.width, self.height)
+        logger.warning(
+            "%s is %d x %d, not %d x %d; it is left out",
+            path,
+            width,
+            height,
+            self.width,
+            self.height,
+        )
         return None
 
     def _waiting(self) -> list[Path]:
@@ -359,7 +424,9 @@ class FolderSource:
         try:
             fresh = [path for path in self._folder.iterdir() if path.name not in self._past]
         except OSError as error:
-            raise SequenceError(f"{self._folder} cannot be read any more: {error.strerror or error}") from error
+            raise SequenceError(
+                f"{self._folder} cannot be read any more: {error.strerror or error}"
+            ) from error
         return sorted(filter(is_image, fresh), key=natural_key)
 
     def _first_size(self) -> tuple[int, int] | None:
@@ -377,12 +444,18 @@ class VideoSource:
     def __init__(self, name: str, wait_s: float) -> None:
         """Open it; a stream or a camera within ``wait_s``, and again within ``wait_s`` where it breaks off."""
         self._name, self._wait_s = name, wait_s
-        self.is_stored = Path(name).is_file() and Path(name).suffix.lower() not in _DESCRIBED_STREAMS
+        self.is_stored = (
+            Path(name).is_file() and Path(name).suffix.lower() not in _DESCRIBED_STREAMS
+        )
         if Path(name).is_fifo():  # OpenCV would wait for ever
-            raise SequenceError(f"{name} is a pipe: let the camera fill a folder, or give the address of its stream")
+            raise SequenceError(
+                f"{name} is a pipe: let the camera fill a folder, or give the address of its stream"
+            )
         self._first = self._opened(Event())
         if self._first is None:
-            raise SequenceError(f"no image comes from {name}: check the camera, the address or the file")
+            raise SequenceError(
+                f"no image comes from {name}: check the camera, the address or the file"
+            )
         self.fps = float(self.is_stored and self._capture.get(cv2.CAP_PROP_FPS)) or DEFAULT_FPS
         self.height, self.width = self._first.shape[:2]
 
@@ -396,17 +469,27 @@ class VideoSource:
             if image.shape[:2] == (self.height, self.width):
                 yield stamp, image
             count, image = count + 1, self._next()
-            if image is None and not self.is_stored and self._capture.get(cv2.CAP_PROP_FRAME_COUNT) <= 0:
-                logger.warning("%s broke off after %d images: it is opened again", self._name, count)
+            if (
+                image is None
+                and not self.is_stored
+                and self._capture.get(cv2.CAP_PROP_FRAME_COUNT) <= 0
+            ):
+                logger.warning(
+                    "%s broke off after %d images: it is opened again", self._name, count
+                )
                 image = self._opened(stopped)
         self._capture.release()
 
     def _opened(self, stopped: Event) -> Image | None:
         """The first image; None where none comes in time."""
-        is_patient = not self.is_stored and (self._name.isdecimal() or "://" in self._name or Path(self._name).exists())
+        is_patient = not self.is_stored and (
+            self._name.isdecimal() or "://" in self._name or Path(self._name).exists()
+        )
         deadline = time.monotonic() + (self._wait_s if is_patient else 0.0)
         while True:
-            self._capture: Any = cv2.VideoCapture(int(self._name) if self._name.isdecimal() else self._name)
+            self._capture: Any = cv2.VideoCapture(
+                int(self._name) if self._name.isdecimal() else self._name
+            )
             image = self._next()
             if image is not None or time.monotonic() > deadline or stopped.wait(_RETRY_S):
                 return image

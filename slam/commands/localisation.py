@@ -23,7 +23,14 @@ from slam.frames import Frame, Image, Intrinsics, View
 from slam.geometry.multiview import consensus, resect
 from slam.geometry.se3 import FloatArray, apply, invert
 from slam.loops.places import Places, PlaceStructure
-from slam.loops.recognition import OF_FRAMES, OF_KEYFRAMES, FeatureExtractor, PlaceIndex, hamming, matches
+from slam.loops.recognition import (
+    OF_FRAMES,
+    OF_KEYFRAMES,
+    FeatureExtractor,
+    PlaceIndex,
+    hamming,
+    matches,
+)
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
 from slam.runtime.files import PLACES
@@ -34,7 +41,9 @@ from slam.sequences.recording import frame_range
 _PLACES_TRIED = 8
 _STARTS = 3  # of these are refined
 _PLACES_AROUND = 12  # around the pose, whose points are looked for in the image
-_MOST_DIFFERING = 50  # bits of descriptors where the pose is known: less sure matches pull it towards itself
+_MOST_DIFFERING = (
+    50  # bits of descriptors where the pose is known: less sure matches pull it towards itself
+)
 _SAMPLES = 300  # of RANSAC
 _LEAST_POINTS = 8  # of a place, to try it
 _LEAST_INLIERS = 30
@@ -64,7 +73,10 @@ class Localisation:
         if T_world_camera is None:
             values = dict.fromkeys(("position", "T_world_camera", "nearest_frame", "inliers"))
             return entry | values | {"reason": self.reason}
-        entry |= {"position": T_world_camera[:3, 3].tolist(), "T_world_camera": T_world_camera.tolist()}
+        entry |= {
+            "position": T_world_camera[:3, 3].tolist(),
+            "T_world_camera": T_world_camera.tolist(),
+        }
         return entry | {"nearest_frame": self.nearest_frame, "inliers": self.inliers}
 
 
@@ -94,10 +106,14 @@ def localise(
     first, last = frame_range(frames or ":", len(paths))
     places = Places.read(run.require(PLACES))
     if not places.views:
-        raise RunError(f"{run.path} has no places: it ran with loops.enabled=false; run the sequence again")
+        raise RunError(
+            f"{run.path} has no places: it ran with loops.enabled=false; run the sequence again"
+        )
     if camera is None:
         folder = images if images.is_dir() else images.parent
-        own_camera = beside(paths[0].parent, folder, folder.absolute().parent)  # where ``run`` looks
+        own_camera = beside(
+            paths[0].parent, folder, folder.absolute().parent
+        )  # where ``run`` looks
     else:
         own_camera = explicit_camera(camera, ImageFiles(in_order(paths)))
     if own_camera is None and places.intrinsics.undistorted:
@@ -132,7 +148,9 @@ def localisation_table(found: Sequence[Localisation]) -> Table:
             position = (f"{value:.2f}" for value in each.T_world_camera[:3, 3])
             row[1:] = [*position, str(each.nearest_frame), str(each.inliers)]
         rows.append(row)
-    notes = [f"{each.image} not found: {each.reason}" for each in found if each.T_world_camera is None]
+    notes = [
+        f"{each.image} not found: {each.reason}" for each in found if each.T_world_camera is None
+    ]
     head = ["image", "x", "y", "z", "nearest\nframe", "inliers"]
     return Table(head, rows, f"{len(found) - len(notes)} of {len(found)} images found", notes)
 
@@ -146,7 +164,12 @@ def write_localisations(path: Path, found: Sequence[Localisation]) -> None:
     if not poses:
         raise RunError(f"none of {len(found)} images was found in the map: {path} is not written")
     write = write_kitti if path.suffix == ".kitti" else write_tum
-    write(path, Trajectory(np.array(list(poses), dtype=np.float64), np.stack(list(poses.values())), numbered=True))
+    write(
+        path,
+        Trajectory(
+            np.array(list(poses), dtype=np.float64), np.stack(list(poses.values())), numbered=True
+        ),
+    )
 
 
 class Localiser:
@@ -180,8 +203,12 @@ class Localiser:
             found = self._found(rows, view, not learned)
         if found.T_world_camera is None:
             return Localisation(name, reason=f"{len(rows)} similar places; {found.reason}")
-        away = np.linalg.norm(self._places.T_world_camera[:, :3, 3] - found.T_world_camera[:3, 3], axis=1)
-        return replace(found, image=name, nearest_frame=self._places.views[int(away.argmin())].index)
+        away = np.linalg.norm(
+            self._places.T_world_camera[:, :3, 3] - found.T_world_camera[:3, 3], axis=1
+        )
+        return replace(
+            found, image=name, nearest_frame=self._places.views[int(away.argmin())].index
+        )
 
     def _view(self, image: Image) -> View:
         camera = self._intrinsics
@@ -192,7 +219,10 @@ class Localiser:
                 raise SequenceError(
                     f"the image is {width}x{height}, its camera {camera.width}x{camera.height}: give its --camera"
                 )
-            image = np.asarray(cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA), np.uint8)
+            image = np.asarray(
+                cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA),
+                np.uint8,
+            )
         no_depth = np.full(image.shape[:2], np.nan, np.float32)
         return self._features.view(Frame(0, 0.0, image), no_depth)
 
@@ -200,11 +230,16 @@ class Localiser:
         """The pose with most corners of the map around it, of those by the places with most inliers; or why not."""
         starts = [start for row in rows if len((start := self._start(row, view, learned))[1])]
         starts.sort(key=lambda start: len(start[1]), reverse=True)
-        found = [self._refined(T_camera_world, rows, view, learned) for T_camera_world, _ in starts[:_STARTS]]
+        found = [
+            self._refined(T_camera_world, rows, view, learned)
+            for T_camera_world, _ in starts[:_STARTS]
+        ]
         nowhere = Localisation(reason="no place has corners that fit one pose")
         return max(found, key=lambda each: each.inliers, default=nowhere)
 
-    def _refined(self, T_camera_world: FloatArray, rows: list[int], view: View, learned: bool) -> Localisation:
+    def _refined(
+        self, T_camera_world: FloatArray, rows: list[int], view: View, learned: bool
+    ) -> Localisation:
         """The pose by all corners of the map around a first one; or why it is none."""
         for widening in (4.0, 2.0, 1.0):
             radius_px = widening * self._thresholds.reprojection_px
@@ -215,12 +250,16 @@ class Localiser:
             T_camera_world = pose.T_camera_world
         inliers = pose.residual_px < self._thresholds.reprojection_px
         count = int(inliers.sum())
-        if count < max(_LEAST_INLIERS, self._thresholds.min_inliers) or count < _LEAST_RATIO * len(inliers):
+        if count < max(_LEAST_INLIERS, self._thresholds.min_inliers) or count < _LEAST_RATIO * len(
+            inliers
+        ):
             return Localisation(reason=f"only {count} of {len(inliers)} corners agree")
         depth = float(np.median(apply(T_camera_world, points[inliers])[:, 2]))
         sigma = float(np.linalg.norm(pose.sigmas[3:])) / depth
         if sigma > _MOST_SIGMA:
-            return Localisation(reason=f"{count} corners agree, but give the position to {sigma:.1%} of their depth")
+            return Localisation(
+                reason=f"{count} corners agree, but give the position to {sigma:.1%} of their depth"
+            )
         return Localisation(T_world_camera=invert(T_camera_world), inliers=count)
 
     def _start(self, row: int, view: View, learned: bool) -> tuple[FloatArray, NDArray[np.intp]]:
@@ -231,10 +270,17 @@ class Localiser:
         if known.sum() < _LEAST_POINTS:
             return np.eye(4), corners[:0]
         pixels = view.pixels[seen[known]].astype(np.float64)
-        return consensus(points[known], pixels, self._intrinsics.K, _SAMPLES, self._thresholds.reprojection_px)
+        return consensus(
+            points[known], pixels, self._intrinsics.K, _SAMPLES, self._thresholds.reprojection_px
+        )
 
     def _around(
-        self, T_camera_world: FloatArray, rows: list[int], view: View, learned: bool, radius_px: float
+        self,
+        T_camera_world: FloatArray,
+        rows: list[int],
+        view: View,
+        learned: bool,
+        radius_px: float,
     ) -> tuple[FloatArray, FloatArray]:
         """Points ``(M, 3)`` of the map that look like corners ``(M, 2)`` of the image near where they project."""
         centre = invert(T_camera_world)[:3, 3]
@@ -261,5 +307,7 @@ def _image_paths(images: Path) -> list[Path]:
     folder = image_folder(images) if images.is_dir() else None
     if folder is None:
         what = "no images in it" if images.is_dir() else "no such file or folder"
-        raise SequenceError(f"{images}: {what}; give an image or a folder of png, jpg or bmp images")
+        raise SequenceError(
+            f"{images}: {what}; give an image or a folder of png, jpg or bmp images"
+        )
     return list_images(folder)

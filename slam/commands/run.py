@@ -32,7 +32,13 @@ from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline
 from slam.prediction.assembly import Prediction, open_prediction
 from slam.prediction.depth_source import FrameNumbers
-from slam.results.estimate_metrics import DepthQuality, estimate_metrics, lidar_trajectory, map_errors, timing_of
+from slam.results.estimate_metrics import (
+    DepthQuality,
+    estimate_metrics,
+    lidar_trajectory,
+    map_errors,
+    timing_of,
+)
 from slam.results.folder import RunFolder, RunLog, check_output, run_log
 from slam.results.metrics import MapMetrics, Metrics, Provenance
 from slam.results.report.page import DepthPictures, Picture, loop_pictures, write_report
@@ -55,7 +61,9 @@ from slam.sequences.poses import read_gps
 
 logger = logging.getLogger(__name__)
 
-NameOrPath = Annotated[str, BeforeValidator(lambda given: str(given) if isinstance(given, Path) else given)]
+NameOrPath = Annotated[
+    str, BeforeValidator(lambda given: str(given) if isinstance(given, Path) else given)
+]
 
 _BEGUN = "the run has not ended, or was killed before its trajectories were written"
 _NO_KEYFRAMES = "no frame for the map has depth"
@@ -84,7 +92,9 @@ class Request(Section):
         """
         if unknown := arguments.keys() - cls.model_fields.keys():
             names = ", ".join(name for name in cls.model_fields if name != "command")
-            raise TypeError(f"run_slam has no argument {', '.join(sorted(unknown))}; it has {names}")
+            raise TypeError(
+                f"run_slam has no argument {', '.join(sorted(unknown))}; it has {names}"
+            )
         try:
             return cls(**arguments)
         except ValidationError as error:
@@ -95,7 +105,10 @@ class Request(Section):
         """The options that name the recording, files by their whole paths; none of the embedded street."""
         given = {name: getattr(self, name, None) for name in _RECORDING}
         named = {name: value for name, value in given.items() if value is not None}
-        return {name: from_anywhere(v) if name == "dataset" or isinstance(v, Path) else v for name, v in named.items()}
+        return {
+            name: from_anywhere(v) if name == "dataset" or isinstance(v, Path) else v
+            for name, v in named.items()
+        }
 
 
 class RunRequest(Request):
@@ -150,7 +163,9 @@ class FolderRecorder(Recorder):
         folder.write(LOOPS, json.dumps(estimate.loops.details(), indent=2, allow_nan=False))
         folder.write(PLACES, estimate.places(sequence.intrinsics).write)
         with estimate.stopwatch.stage("evaluation"):
-            self._metrics = estimate_metrics(estimate, sequence, self._provenance, self._settings.gps.factors)
+            self._metrics = estimate_metrics(
+                estimate, sequence, self._provenance, self._settings.gps.factors
+            )
         folder.write_metrics(self._metrics)
         self._stopwatch = estimate.stopwatch
         self._quality = DepthQuality(sequence, estimate.scale.is_metric)
@@ -175,7 +190,11 @@ class FolderRecorder(Recorder):
             surface.write_cloud(self.folder.path / MAP_CLOUD)
         with self._stopwatch.stage("evaluation"):
             metric = estimate.scale.is_metric
-            share = double_wall_share(surface.meshes()) if metric else Failed("lengths are not in metres")
+            share = (
+                double_wall_share(surface.meshes())
+                if metric
+                else Failed("lengths are not in metres")
+            )
             pieces = lambda: (Ply(piece).points for piece in surface.cloud_pieces())  # noqa: E731
             errors = map_errors(pieces, estimate, self.pipeline.sequence)
         self._progress("map files", 1, 1)
@@ -189,7 +208,9 @@ class FolderRecorder(Recorder):
             return estimate
         if estimate.map is None:
             is_enabled = self._settings.mapping.enabled
-            return Failed(_NO_KEYFRAMES if is_enabled else "fusion is switched off (mapping.enabled)")
+            return Failed(
+                _NO_KEYFRAMES if is_enabled else "fusion is switched off (mapping.enabled)"
+            )
         try:
             with self._stopwatch.stage("mesh"):
                 return estimate.map.surface(self._progress)
@@ -217,7 +238,9 @@ class FolderRecorder(Recorder):
 
     def fail(self, error: BaseException) -> str:
         """Write the reason of a failure, which is returned; errors of writing are ignored, for the first is raised."""
-        reason = explained(error) if isinstance(error, Exception) else str(error) or type(error).__name__
+        reason = (
+            explained(error) if isinstance(error, Exception) else str(error) or type(error).__name__
+        )
         with suppress(SlamError, OSError):
             self.folder.write_metrics(self._metrics.changed(status="failed", reason=reason))
             self.leave()
@@ -236,12 +259,16 @@ class FolderRecorder(Recorder):
             try:
                 return sequence.frame(index).image
             except SlamError:
-                return next((each.image for each in estimate.drive.keyframes if each.index == index), None)
+                return next(
+                    (each.image for each in estimate.drive.keyframes if each.index == index), None
+                )
 
         return loop_pictures(estimate.loops.accepted, image, sequence.intrinsics)
 
 
-def run_slam(dataset: str | Path | None = None, sequence: str | None = None, **options: Any) -> RunFolder:
+def run_slam(
+    dataset: str | Path | None = None, sequence: str | None = None, **options: Any
+) -> RunFolder:
     """Run the whole system on one sequence.
 
     Without ``progress``, the log says every ten seconds (level INFO) what is done; in a notebook its cell does.
@@ -256,7 +283,9 @@ def run_slam(dataset: str | Path | None = None, sequence: str | None = None, **o
         return perform(RunRequest.of(dataset=dataset, sequence=sequence, **options))
     in_notebook = "ipykernel" in sys.modules
     with progress_bar() if in_notebook else progress_lines(logger.info) as progress:
-        return perform(RunRequest.of(dataset=dataset, sequence=sequence, **options | {"progress": progress}))
+        return perform(
+            RunRequest.of(dataset=dataset, sequence=sequence, **options | {"progress": progress})
+        )
 
 
 def perform(request: RunRequest) -> RunFolder:
@@ -274,17 +303,27 @@ def perform(request: RunRequest) -> RunFolder:
         if request.rerun is not None:
             import_extra("rerun")
         settings = load_config(request.config, request.overrides or ())
-        recording = open_sequence(request.dataset, request.sequence, request.camera, request.frames, request.truth)
+        recording = open_sequence(
+            request.dataset, request.sequence, request.camera, request.frames, request.truth
+        )
         lens, camera = recording.undistortion, recording.intrinsics
-        numbers = FrameNumbers(len(recording), recording.start, recording.recorded)  # by which files of depth are found
+        numbers = FrameNumbers(
+            len(recording), recording.start, recording.recorded
+        )  # by which files of depth are found
         undistort = None if lens is None else lens.apply_to_depth
-        prediction = open_prediction(request.weights, request.device, settings.depth, camera, numbers, undistort)
+        prediction = open_prediction(
+            request.weights, request.device, settings.depth, camera, numbers, undistort
+        )
         track = None if request.gps is None else read_gps(request.gps)
         progress = request.progress
-        pipeline = SlamPipeline(recording, prediction.predictor, settings, progress, request.seed, track)
+        pipeline = SlamPipeline(
+            recording, prediction.predictor, settings, progress, request.seed, track
+        )
         pipeline.require_possible()
         folder = RunFolder.create(request.output, Path(settings.output.root), recording.name, lock)
-        recorder = FolderRecorder(folder, pipeline, settings, provenance_of(request, prediction, recording), progress)
+        recorder = FolderRecorder(
+            folder, pipeline, settings, provenance_of(request, prediction, recording), progress
+        )
         estimate = record(recorder, log, ignore_signals)
         if request.rerun is not None:
             write_rerun(request.rerun, estimate, pipeline.sequence.intrinsics)
@@ -318,7 +357,9 @@ def record(
 def provenance_of(request: Request, prediction: Prediction, recording: FrameSequence) -> Provenance:
     """The input of a run: networks, depth, and the options that name the recording."""
     networks, source = prediction.networks, prediction.source
-    is_folder = Path(request.weights) == Path(networks.origin)  # else a shipped name, whatever lies here
+    is_folder = Path(request.weights) == Path(
+        networks.origin
+    )  # else a shipped name, whatever lies here
     return Provenance(
         version=__version__,
         commit=commit(),

@@ -19,7 +19,10 @@ from slam.runtime.errors import ConfigError
 from slam.runtime.imports import plug_ins
 
 _HERE = Path(__file__).resolve().parents[1]
-_SHIPPED = (_HERE.parent / "configs" / "slam", _HERE / "_configs")  # in the source tree, in the wheel
+_SHIPPED = (
+    _HERE.parent / "configs" / "slam",
+    _HERE / "_configs",
+)  # in the source tree, in the wheel
 dump_yaml = dump_explained  # with the description of every key
 DEPTH_SOURCES = ("onnx", "npy", "png")
 DEPTH_PLUG_INS = "erfsfm_slam.depth"  # entry points of other packages: see docs/depth.md
@@ -31,7 +34,8 @@ class DepthConfig(Section):
     """The source of depth and the refinement of the keyframes' depth, see ``docs/depth.md``."""
 
     source: str = Field(
-        default="network", description="network, onnx:FILE, or npy:FOLDER or png:FOLDER with one file a frame"
+        default="network",
+        description="network, onnx:FILE, or npy:FOLDER or png:FOLDER with one file a frame",
     )
     frame_stride: int = Field(
         default=2,
@@ -52,20 +56,28 @@ class DepthConfig(Section):
         description="onnx: mean of RGB in [0, 1], which is subtracted; null for ONNX files of erfsfm export",
     )
     std: tuple[PositiveFloat, PositiveFloat, PositiveFloat] | None = Field(
-        default=None, description="onnx: standard deviation, by which RGB less the mean is divided; null likewise"
+        default=None,
+        description="onnx: standard deviation, by which RGB less the mean is divided; null likewise",
     )
     size: tuple[PositiveInt, PositiveInt] | None = Field(
         default=None, description="onnx: height and width of the input; null if the file fixes them"
     )
-    output_name: str = Field(default="", description="onnx: name of the output, if the network has several")
+    output_name: str = Field(
+        default="", description="onnx: name of the output, if the network has several"
+    )
     png_scale: float = Field(
-        default=256.0, gt=0, description="png: value of a pixel at a depth of 1 m; a pixel of 0 is unknown"
+        default=256.0,
+        gt=0,
+        description="png: value of a pixel at a depth of 1 m; a pixel of 0 is unknown",
     )
     refine: Literal["none", "learned"] = Field(
         default="learned",
         description="the keyframes' depth by neighbouring images at the optimised poses; learned: a network fuses both",
     )
-    fusion: str = Field(default="default", description="learned: default, or an output folder of erfsfm train-fusion")
+    fusion: str = Field(
+        default="default",
+        description="learned: default, or an output folder of erfsfm train-fusion",
+    )
 
     @property
     def is_learned(self) -> bool:
@@ -85,7 +97,11 @@ class DepthConfig(Section):
             return source
         others = plug_ins(DEPTH_PLUG_INS)
         if not (kind in others and colon and path):
-            raise ValueError(", ".join(("network, onnx:FILE, npy:FOLDER or png:FOLDER", *(f"{n}:..." for n in others))))
+            raise ValueError(
+                ", ".join(
+                    ("network, onnx:FILE, npy:FOLDER or png:FOLDER", *(f"{n}:..." for n in others))
+                )
+            )
         return source
 
 
@@ -122,10 +138,18 @@ class LidarConfig(Section):
 class GpsConfig(Section):
     """A GPS track beside the images, see ``docs/gps.md``."""
 
-    factors: bool = Field(default=True, description="add the positions to the pose graph; false: only compare them")
-    sigma_m: float = Field(default=2.5, gt=0, description="sigma of a fix east and north where its HDOP is 1, metres")
-    vertical_sigma_m: float = Field(default=5.0, gt=0, description="sigma of the height of a fix, metres")
-    correlation_s: float = Field(default=10.0, ge=0, description="time for which fixes share their error, seconds")
+    factors: bool = Field(
+        default=True, description="add the positions to the pose graph; false: only compare them"
+    )
+    sigma_m: float = Field(
+        default=2.5, gt=0, description="sigma of a fix east and north where its HDOP is 1, metres"
+    )
+    vertical_sigma_m: float = Field(
+        default=5.0, gt=0, description="sigma of the height of a fix, metres"
+    )
+    correlation_s: float = Field(
+        default=10.0, ge=0, description="time for which fixes share their error, seconds"
+    )
     offset_s: float = Field(default=0.0, description="added to the stamps of the fixes, seconds")
 
 
@@ -133,16 +157,22 @@ class ScaleConfig(Section):
     """Metric scale, see ``frontend/scale.py``."""
 
     mode: Literal["auto", "none", "camera-height", "lidar", "reference", "known", "gps"] = Field(
-        default="auto", description="auto: camera-height where a height is known, else gps with --gps, else none"
+        default="auto",
+        description="auto: camera-height where a height is known, else gps with --gps, else none",
     )
-    known_m: float | None = Field(default=None, gt=0, description="mode known: distance of the two frames, metres")
+    known_m: float | None = Field(
+        default=None, gt=0, description="mode known: distance of the two frames, metres"
+    )
     known_between: tuple[int | str, int | str] | None = Field(
-        default=None, description="mode known: two frames of the run, or stamps in seconds such as 12.5s"
+        default=None,
+        description="mode known: two frames of the run, or stamps in seconds such as 12.5s",
     )
 
     @field_validator("known_between")
     @classmethod
-    def _frames_or_stamps(cls, ends: tuple[int | str, int | str] | None) -> tuple[int | str, int | str] | None:
+    def _frames_or_stamps(
+        cls, ends: tuple[int | str, int | str] | None
+    ) -> tuple[int | str, int | str] | None:
         for end in ends or ():
             if (end < 0) if isinstance(end, int) else not re.fullmatch(r"-?\d+(\.\d*)?s", end):
                 raise ValueError("two frame numbers, or stamps in seconds such as 12.5s")
@@ -165,11 +195,15 @@ class MappingConfig(Section):
     """The map, see ``docs/design/map.md``. Without metres, all lengths here follow the depth of the scene."""
 
     enabled: bool = Field(default=True, description="fuse depth maps into a mesh and a point cloud")
-    keyframe_distance_m: float = Field(default=1.5, ge=0, description="distance between keyframes, metres")
+    keyframe_distance_m: float = Field(
+        default=1.5, ge=0, description="distance between keyframes, metres"
+    )
     voxel_size_m: float = Field(default=0.2, ge=1e-3, le=100, description="side of a voxel, metres")
     depth_min_m: float = Field(default=1.0, ge=0, description="smallest fused depth, metres")
     depth_max_m: float = Field(
-        default=20.0, gt=0, description="largest fused depth, metres; up to 1.4 times that where it is certain"
+        default=20.0,
+        gt=0,
+        description="largest fused depth, metres; up to 1.4 times that where it is certain",
     )
     hood_crop: float = Field(
         default=0.0,
@@ -178,10 +212,14 @@ class MappingConfig(Section):
         description="height of the lower part with the car's own hood that is left out, over the image's height",
     )
     close_holes_m: float = Field(
-        default=1.5, ge=0, description="largest diameter of a hole of the road that is closed, metres"
+        default=1.5,
+        ge=0,
+        description="largest diameter of a hole of the road that is closed, metres",
     )
     memory_mb: int = Field(
-        default=1000, ge=100, description="memory of the map, MiB; a submap ends before it takes more"
+        default=1000,
+        ge=100,
+        description="memory of the map, MiB; a submap ends before it takes more",
     )
 
     @property
@@ -191,7 +229,11 @@ class MappingConfig(Section):
 
     def in_unit(self, per_metre: float) -> MappingConfig:
         """The same lengths in a unit of which a metre has ``per_metre``."""
-        lengths = {name: per_metre * getattr(self, name) for name in type(self).model_fields if name.endswith("_m")}
+        lengths = {
+            name: per_metre * getattr(self, name)
+            for name in type(self).model_fields
+            if name.endswith("_m")
+        }
         return self.model_copy(update=lengths)
 
     @model_validator(mode="after")
@@ -223,7 +265,9 @@ class SlamConfig(Section):
     output: OutputConfig = OutputConfig()
 
 
-def load_config(file_or_name: str | Path | None = None, overrides: Sequence[str] = ()) -> SlamConfig:
+def load_config(
+    file_or_name: str | Path | None = None, overrides: Sequence[str] = ()
+) -> SlamConfig:
     """Read a configuration and change some of its keys.
 
     Args:

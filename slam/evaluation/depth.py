@@ -77,7 +77,9 @@ class DepthErrors:
         coverage: dict[str, float] | Failed = Failed("the network states no noise of its depth")
         if not np.isnan(sigma).any():
             errors = np.log(ratio) / sigma
-            coverage = {str(level): float((errors < ndtri(0.5 + level / 200)).mean()) for level in COVERAGES}
+            coverage = {
+                str(level): float((errors < ndtri(0.5 + level / 200)).mean()) for level in COVERAGES
+            }
         return DepthMetrics.of(
             abs_rel=float(relative.mean()),
             median_rel=float(np.median(relative)),

@@ -43,7 +43,11 @@ COVERED_WITHIN_M = 0.3
 F_SCORES_M = {"0.2": 0.2, "0.5": 0.5}
 BINS_M = ((0.0, 5.0), (5.0, 10.0), (10.0, 15.0), (15.0, 20.0), (20.0, 25.0))
 OUTLIER_M = 1.0
-VIEW_STEP_M, SPARSE_VIEW_STEP_M, VIEW_STEP_DEG = 1.0, 3.0, 5.0  # sparse where views do not measure the accuracy
+VIEW_STEP_M, SPARSE_VIEW_STEP_M, VIEW_STEP_DEG = (
+    1.0,
+    3.0,
+    5.0,
+)  # sparse where views do not measure the accuracy
 SAMPLE_VOXEL_M = 0.2
 
 _WALL_NEAR_M, _WALL_FAR_M = 0.3, 2.0  # of the second surface in front of the first
@@ -86,7 +90,9 @@ def thinned(points: FloatArray, voxel_m: float, order: Indices) -> Indices:
     """Of the points ``(P, 3)`` in each voxel the one that comes first in an order ``(P,)``: their indices."""
     key = np.zeros(len(points), dtype=np.int64)
     for axis in points.T:  # one at a time, for there are millions
-        key = (key << _KEY_BITS) | (np.floor(axis / voxel_m).astype(np.int64) + (1 << (_KEY_BITS - 1)))
+        key = (key << _KEY_BITS) | (
+            np.floor(axis / voxel_m).astype(np.int64) + (1 << (_KEY_BITS - 1))
+        )
     first: Indices = order[np.unique(key[order], return_index=True)[1]]
     return first
 
@@ -101,7 +107,9 @@ def stretches(T_world_camera: FloatArray, truth_frames: Indices) -> list[Indices
     positions = T_world_camera[:, :3, 3]
     away, _ = cKDTree(positions[truth_frames]).query(positions)
     number = (path_distance(T_world_camera) / STRETCH_M).astype(np.int64)
-    parts = [np.flatnonzero((number == k) & (away <= _NEAR_TRUTH_M)) for k in range(int(number[-1]) + 1)]
+    parts = [
+        np.flatnonzero((number == k) & (away <= _NEAR_TRUTH_M)) for k in range(int(number[-1]) + 1)
+    ]
     parts = [part for part in parts if len(part)]
     if len(parts) <= MOST_STRETCHES:
         return parts
@@ -130,7 +138,9 @@ def accumulated(truth: SurfaceTruth, views: Indices, positions: FloatArray) -> S
     return surface
 
 
-def backprojected(depth_m: FloatArray, rays: FloatArray, T_world_camera: FloatArray, range_m: float) -> FloatArray:
+def backprojected(
+    depth_m: FloatArray, rays: FloatArray, T_world_camera: FloatArray, range_m: float
+) -> FloatArray:
     """Points ``(P, 3)`` in the world of z-depth ``(H, W)``, no further than ``range_m`` from the camera.
 
     Depth is 0 or not finite where unknown; ``rays`` ``(H, W, 3)`` go through every pixel, z = 1.
@@ -178,13 +188,23 @@ class PlacedMetrics(SurfaceMetrics):
 
 
 ERRORS = (
-    *("accuracy_median_m", "accuracy_90_m", "outlier_share", "completeness", "f_score", "precision", "recall"),
+    *(
+        "accuracy_median_m",
+        "accuracy_90_m",
+        "outlier_share",
+        "completeness",
+        "f_score",
+        "precision",
+        "recall",
+    ),
     *("in_field", "by_distance"),
 )
 """The values of every `PlacedMetrics`."""
 
 
-def pose_similarity(T_world_camera_true: FloatArray, T_world_camera: FloatArray, with_scale: bool = True) -> Similarity:
+def pose_similarity(
+    T_world_camera_true: FloatArray, T_world_camera: FloatArray, with_scale: bool = True
+) -> Similarity:
     """The similarity, or rigid motion, that takes a trajectory and its map to the truth, poses ``(N, 4, 4)`` both.
 
     Least squares of positions and of points 10 m from every camera: positions alone do not determine the roll about a
@@ -232,13 +252,19 @@ def compare(
     step_m = VIEW_STEP_M if truth.distance is None else SPARSE_VIEW_STEP_M
     views = truth.frames[moved_rows(T_world_camera[truth.frames], step_m, VIEW_STEP_DEG)]
     cameras = cKDTree(T_world_camera[:, :3, 3])
-    nearest = {name: cameras.query(points, distance_upper_bound=RANGE_M) for name, points in maps.items()}
+    nearest = {
+        name: cameras.query(points, distance_upper_bound=RANGE_M) for name, points in maps.items()
+    }
     found: dict[str, list[tuple[NDArray[Any], ...]]] = {name: [] for name in maps}
     for stretch in parts:
         positions = T_world_camera[:, :3, 3]
         away_from_stretch, _ = cKDTree(positions[stretch]).query(positions[views])
-        near = views[away_from_stretch <= 2 * RANGE_M]  # the views that can see surfaces near the stretch
-        to_surface, on_surface, surface_range = _surface_along(truth, near, T_world_camera, cameras, stretch)
+        near = views[
+            away_from_stretch <= 2 * RANGE_M
+        ]  # the views that can see surfaces near the stretch
+        to_surface, on_surface, surface_range = _surface_along(
+            truth, near, T_world_camera, cameras, stretch
+        )
         for name, points in maps.items():
             away, camera = nearest[name]
             own = _sampled(points, np.flatnonzero(np.isin(camera, stretch) & np.isfinite(away)))
@@ -246,7 +272,9 @@ def compare(
             in_field, to_map = truth.in_field(points[own], near), _to_map(on_surface, points)
             found[name].append((distances, away[own], in_field, to_map, surface_range))
         del to_surface  # it holds the surface
-    together = {name: MapDistances(*map(np.concatenate, zip(*each))) for name, each in found.items()}
+    together = {
+        name: MapDistances(*map(np.concatenate, zip(*each))) for name, each in found.items()
+    }
     to_next = np.append(np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1), 0.0)
     return together, float(sum(to_next[part].sum() for part in parts))
 
@@ -278,7 +306,9 @@ def _errors(own: FloatArray, true: FloatArray, least: int) -> dict[str, Any]:
         "accuracy_90_m": no_map or float(np.quantile(own, 0.9)),
         "outlier_share": no_map or _share(own > OUTLIER_M),
         "completeness": no_surface or _share(true <= COVERED_WITHIN_M),
-        "f_score": Within.of(**{key: _harmonic_mean(precision[key], recall[key]) for key in F_SCORES_M}),
+        "f_score": Within.of(
+            **{key: _harmonic_mean(precision[key], recall[key]) for key in F_SCORES_M}
+        ),
         "precision": Within.of(**precision),
         "recall": Within.of(**recall),
     }
@@ -303,7 +333,11 @@ def _sampled(points: FloatArray, candidates: Indices) -> Indices:
 
 
 def _surface_along(
-    truth: SurfaceTruth, views: Indices, T_world_camera: FloatArray, cameras: cKDTree, stretch: Indices
+    truth: SurfaceTruth,
+    views: Indices,
+    T_world_camera: FloatArray,
+    cameras: cKDTree,
+    stretch: Indices,
 ) -> tuple[Callable[[FloatArray], FloatArray], FloatArray, FloatArray]:
     """The true surface around a stretch, from these views, as the function from points ``(P, 3)`` to their distances.
 
@@ -342,7 +376,9 @@ def double_wall_share(pieces: Iterable[tuple[FloatArray, NDArray[np.int64]]]) ->
         chosen = np.flatnonzero(doubled_area > 0)
         chosen = chosen[:: -(-len(chosen) // _MOST_RAYS) or 1]
         direction = normal[chosen] / doubled_area[chosen, None]
-        rays = np.concatenate([corners[chosen].mean(axis=1) + _WALL_NEAR_M * direction, direction], axis=1)
+        rays = np.concatenate(
+            [corners[chosen].mean(axis=1) + _WALL_NEAR_M * direction, direction], axis=1
+        )
         scene = scene_of(vertices.astype(np.float32), triangles.astype(np.uint32))
         answer = scene.cast_rays(import_open3d().core.Tensor(rays.astype(np.float32)))
         cosine = (answer["primitive_normals"].numpy() * direction).sum(axis=1)

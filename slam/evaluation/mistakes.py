@@ -49,12 +49,20 @@ _OF_POSITIONS: tuple[tuple[str, Change], ...] = (
     ("is the frame of one left-handed? Mirrored, the estimate", _mirrored),
 )
 _OF_ROTATIONS: tuple[tuple[str, Change], ...] = (
-    ("are the quaternions of the estimate w x y z, where TUM has x y z w? Reordered, it", _requaternioned),
-    ("are the rotations of one those of the world in the camera? Transposed, the estimate", _transposed),
+    (
+        "are the quaternions of the estimate w x y z, where TUM has x y z w? Reordered, it",
+        _requaternioned,
+    ),
+    (
+        "are the rotations of one those of the world in the camera? Transposed, the estimate",
+        _transposed,
+    ),
 )
 
 
-def likely_mistakes(estimate: Trajectory, reference: Trajectory, pair: tuple[Trajectory, Trajectory]) -> list[str]:
+def likely_mistakes(
+    estimate: Trajectory, reference: Trajectory, pair: tuple[Trajectory, Trajectory]
+) -> list[str]:
     """What was probably done to one of the trajectories, a line each; none where nothing fits much better.
 
     Args:
@@ -68,13 +76,28 @@ def likely_mistakes(estimate: Trajectory, reference: Trajectory, pair: tuple[Tra
     if len(T_reference) < _LEAST_POSES or not extent > 0:
         return []
     as_given = _ate(T_estimate[:, :3, 3], T_reference[:, :3, 3])
-    fits = [(_ate(change(T_estimate)[:, :3, 3], T_reference[:, :3, 3]), words) for words, change in _OF_POSITIONS]
+    fits = [
+        (_ate(change(T_estimate)[:, :3, 3], T_reference[:, :3, 3]), words)
+        for words, change in _OF_POSITIONS
+    ]
     best, words = min(fits)
     if estimate.timed == reference.timed:
         shift, unshifted, shifted = _clock(estimate, reference)
-        rowwise = _ate(estimate.positions, reference.positions) if len(estimate) == len(reference) else np.inf
-        if rowwise * _BETTER < unshifted and rowwise * _BETTER_THAN_SHIFT < shifted and rowwise < best:
-            return [_said("does the clock of one run faster? Row by row, the estimate", unshifted, rowwise)]
+        rowwise = (
+            _ate(estimate.positions, reference.positions)
+            if len(estimate) == len(reference)
+            else np.inf
+        )
+        if (
+            rowwise * _BETTER < unshifted
+            and rowwise * _BETTER_THAN_SHIFT < shifted
+            and rowwise < best
+        ):
+            return [
+                _said(
+                    "does the clock of one run faster? Row by row, the estimate", unshifted, rowwise
+                )
+            ]
         if shifted * _BETTER < unshifted and shifted < best:
             by = f"stamps by {shift:+.2f} s" if estimate.timed else f"frame numbers by {shift:+.0f}"
             return [_said(f"a shift of the estimate's {by}", unshifted, shifted)]
@@ -105,7 +128,10 @@ def _clock(estimate: Trajectory, reference: Trajectory) -> tuple[float, float, f
         inside = (times >= reference.stamps[0]) & (times <= reference.stamps[-1])
         if inside.sum() < max(_LEAST_OVERLAP * len(times), _LEAST_POSES):
             return unmatched
-        truth = [np.interp(times[inside], reference.stamps, reference.positions[:, axis]) for axis in range(3)]
+        truth = [
+            np.interp(times[inside], reference.stamps, reference.positions[:, axis])
+            for axis in range(3)
+        ]
         return _ate(positions[inside], np.column_stack(truth))
 
     most = min(_LONGEST_SHIFT_S, stamps[-1] - stamps[0])

@@ -63,13 +63,17 @@ def aligned(trajectories: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
         for name in trajectories.keys() - {REFERENCE}:
             estimate, truth = associate(drawn[name], drawn[REFERENCE])
             fit = se3.umeyama(truth.positions, estimate.positions, with_scale=True)
-            drawn[name] = replace(drawn[name], T_world_camera=fit.apply_to_poses(drawn[name].T_world_camera))
+            drawn[name] = replace(
+                drawn[name], T_world_camera=fit.apply_to_poses(drawn[name].T_world_camera)
+            )
     elif "network" in drawn and "optimised" in drawn:
         raw, optimised = associate(drawn["network"], drawn["optimised"])
         energy = float((raw.positions**2).sum())
         scale = float((raw.positions * optimised.positions).sum()) / energy if energy > 0 else 1.0
         fit = se3.Similarity(scale, np.eye(3), np.zeros(3))
-        drawn["network"] = replace(drawn["network"], T_world_camera=fit.apply_to_poses(drawn["network"].T_world_camera))
+        drawn["network"] = replace(
+            drawn["network"], T_world_camera=fit.apply_to_poses(drawn["network"].T_world_camera)
+        )
     return drawn
 
 
@@ -106,7 +110,10 @@ def segment_errors(
 
 
 def relative_errors(
-    T_world_estimate: FloatArray, T_world_reference: FloatArray, starts: IndexArray, ends: IndexArray
+    T_world_estimate: FloatArray,
+    T_world_reference: FloatArray,
+    starts: IndexArray,
+    ends: IndexArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Translation (metres) and rotation (radians) errors ``(M,)`` of the motions between pairs of rows.
 
@@ -147,7 +154,9 @@ class Aligned:
         segments = segment_errors(self.T_world_estimate, self.T_world_reference, KITTI_LENGTHS_M)
         if not segments:
             path_m = se3.path_distance(self.T_world_reference)[-1]
-            return Failed(f"no segment of {KITTI_LENGTHS_M[0]:.0f} m fits into the path of {path_m:.1f} m")
+            return Failed(
+                f"no segment of {KITTI_LENGTHS_M[0]:.0f} m fits into the path of {path_m:.1f} m"
+            )
         return float(np.concatenate([errors_per_m(each) for each in segments]).mean())
 
 
@@ -164,9 +173,13 @@ def _ate(pair: Aligned) -> float:
     return float(np.sqrt((offsets**2).sum(axis=1).mean()))
 
 
-_T_REL = Statistic("t_rel\n%", 2, lambda pair: pair.drift(lambda each: 100.0 * each.translation_m / each.length_m))
+_T_REL = Statistic(
+    "t_rel\n%", 2, lambda pair: pair.drift(lambda each: 100.0 * each.translation_m / each.length_m)
+)
 _R_REL = Statistic(
-    "r_rel\ndeg/100m", 3, lambda pair: pair.drift(lambda each: 100.0 * np.rad2deg(each.rotation) / each.length_m)
+    "r_rel\ndeg/100m",
+    3,
+    lambda pair: pair.drift(lambda each: 100.0 * np.rad2deg(each.rotation) / each.length_m),
 )
 _RPE_M = Statistic("RPE\nm", 4, lambda pair: float(pair.step_errors[0].mean()))
 _RPE_DEG = Statistic("RPE\ndeg", 4, lambda pair: float(np.rad2deg(pair.step_errors[1].mean())))
@@ -234,8 +247,12 @@ def trajectory_metrics(
         aligned = Alignments.of(**dict.fromkeys(ALIGNMENTS, AlignedMetrics.unknown(reason)))
         return TrajectoryMetrics(snippet5=snippets, align=aligned, evo=EvoMetrics.unknown(reason))
     T_world_estimate, T_world_reference = estimate.T_world_camera, reference.T_world_camera
-    ours = {name: _alignment_metrics(T_world_estimate, T_world_reference, name) for name in ALIGNMENTS}
-    predicted, true = (snippets_from_trajectory(T, SNIPPET_LENGTH) for T in (T_world_estimate, T_world_reference))
+    ours = {
+        name: _alignment_metrics(T_world_estimate, T_world_reference, name) for name in ALIGNMENTS
+    }
+    predicted, true = (
+        snippets_from_trajectory(T, SNIPPET_LENGTH) for T in (T_world_estimate, T_world_reference)
+    )
     without_ate = None
     if _stands_still(T_world_reference):
         without_ate = _REFERENCE_STANDS_STILL
@@ -253,7 +270,9 @@ def trajectory_metrics(
     )
 
 
-def align(T_world_estimate: FloatArray, T_world_reference: FloatArray, alignment: Alignment) -> Aligned:
+def align(
+    T_world_estimate: FloatArray, T_world_reference: FloatArray, alignment: Alignment
+) -> Aligned:
     """Bring an estimate to a reference, both ``(N, 4, 4)``.
 
     ``none`` as written; ``first`` both rebased to their first pose; ``scale`` then also one factor,
@@ -271,7 +290,11 @@ def align(T_world_estimate: FloatArray, T_world_reference: FloatArray, alignment
         fit = se3.umeyama(g, p, with_scale=scaled and not still)
     elif scaled and not still:
         fit = se3.Similarity(float((g * p).sum() / (p * p).sum()), np.eye(3), np.zeros(3))
-    scale = Failed("the estimate does not move, so its scale is undefined") if scaled and still else fit.scale
+    scale = (
+        Failed("the estimate does not move, so its scale is undefined")
+        if scaled and still
+        else fit.scale
+    )
     return Aligned(fit.apply_to_poses(T_world_estimate), T_world_reference, scale)
 
 
@@ -283,7 +306,9 @@ def evo_commands(estimate: Path | str, reference: Path | str, format: str = "aut
     a, b = read_trajectory(estimate, format), read_trajectory(reference, format)
     if a.timed != b.timed or a.rows or b.rows:
         return []
-    if not all(np.isin(ours.stamps, whole.stamps).all() for ours, whole in zip(associate(a, b), (a, b))):
+    if not all(
+        np.isin(ours.stamps, whole.stamps).all() for ours, whole in zip(associate(a, b), (a, b))
+    ):
         return []
     files = f"{'tum' if a.timed else 'kitti'} {shlex.quote(str(reference))} {shlex.quote(str(estimate))}"
     options = "--align --correct_scale"
@@ -338,7 +363,11 @@ def _why_not(estimate: Trajectory, reference: Trajectory | None) -> str:
     for name, trajectory in (("estimate", estimate), ("reference", reference)):
         if not np.isfinite(trajectory.T_world_camera).all():
             return f"the {name} has poses that are not finite"
-    if len(estimate) > 1 and _is_constant(estimate.T_world_camera) and _is_constant(reference.T_world_camera):
+    if (
+        len(estimate) > 1
+        and _is_constant(estimate.T_world_camera)
+        and _is_constant(reference.T_world_camera)
+    ):
         return _NOTHING_MOVES
     return ""
 
@@ -355,19 +384,26 @@ def _alignment_metrics(
     aligned = align(T_world_estimate, T_world_reference, alignment)
     if not isinstance(aligned.scale, Failed) and aligned.scale <= 0:
         return AlignedMetrics.unknown(_BACKWARDS.reason)
-    return AlignedMetrics.of(**{name: each.formula(aligned) for name, each in AlignedMetrics.statistics().items()})
+    return AlignedMetrics.of(
+        **{name: each.formula(aligned) for name, each in AlignedMetrics.statistics().items()}
+    )
 
 
-def _snippet_metrics(errors: SnippetErrors | None, without_ate: Failed | None = None) -> SnippetMetrics:
+def _snippet_metrics(
+    errors: SnippetErrors | None, without_ate: Failed | None = None
+) -> SnippetMetrics:
     if errors is None:
         few = Failed(f"a snippet needs {SNIPPET_LENGTH} frames")
         return SnippetMetrics.of(ate_mean=few, ate_std=few, re_mean=few, re_std=few, count=0)
     return SnippetMetrics.of(
-        **asdict(errors) | ({"ate_mean": without_ate, "ate_std": without_ate} if without_ate else {})
+        **asdict(errors)
+        | ({"ate_mean": without_ate, "ate_std": without_ate} if without_ate else {})
     )
 
 
-def _evo_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray, ours: AlignedMetrics) -> EvoMetrics:
+def _evo_metrics(
+    T_world_estimate: FloatArray, T_world_reference: FloatArray, ours: AlignedMetrics
+) -> EvoMetrics:
     """The statistics of ``7dof`` again, computed by evo alone, and the largest disagreement with ours."""
     if ours.ate_rmse_m is None:
         return EvoMetrics.unknown(ours.why("ate_rmse_m"))
@@ -375,14 +411,25 @@ def _evo_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray, ou
     from evo.core.metrics import APE, RPE, PoseRelation, StatisticsType, Unit
     from evo.core.trajectory import PosePath3D
 
-    estimate, reference = PosePath3D(poses_se3=[*T_world_estimate]), PosePath3D(poses_se3=[*T_world_reference])
+    estimate, reference = (
+        PosePath3D(poses_se3=[*T_world_estimate]),
+        PosePath3D(poses_se3=[*T_world_reference]),
+    )
     values = {}
     try:
         estimate.align(reference, correct_scale=True)
         for key, metric, statistic in (
             ("ape_rmse_m_7dof", APE(PoseRelation.translation_part), StatisticsType.rmse),
-            ("rpe_trans_m", RPE(PoseRelation.translation_part, 1, Unit.frames), StatisticsType.mean),
-            ("rpe_rot_deg", RPE(PoseRelation.rotation_angle_deg, 1, Unit.frames), StatisticsType.mean),
+            (
+                "rpe_trans_m",
+                RPE(PoseRelation.translation_part, 1, Unit.frames),
+                StatisticsType.mean,
+            ),
+            (
+                "rpe_rot_deg",
+                RPE(PoseRelation.rotation_angle_deg, 1, Unit.frames),
+                StatisticsType.mean,
+            ),
         ):
             metric.process_data((reference, estimate))
             values[key] = float(metric.get_statistic(statistic))

@@ -76,7 +76,12 @@ def write_colmap(
     """
     of_frames = {k: rows for k, rows in sightings.of_frames().items() if k not in without_image}
     width, height = intrinsics.width, intrinsics.height
-    fx, fy, cx, cy = intrinsics.fx, intrinsics.fy, intrinsics.cx + _HALF_PIXEL, intrinsics.cy + _HALF_PIXEL
+    fx, fy, cx, cy = (
+        intrinsics.fx,
+        intrinsics.fy,
+        intrinsics.cx + _HALF_PIXEL,
+        intrinsics.cy + _HALF_PIXEL,
+    )
     pinhole = [float(value) for value in (fx, fy, cx, cy)]
     camera = [f"1 PINHOLE {width} {height} {' '.join(map(repr, pinhole))}"]
     packed_camera = [struct.pack("<IiQQ4d", 1, _PINHOLE, width, height, *pinhole)]
@@ -86,7 +91,9 @@ def write_colmap(
     lines, parts = (camera, images, points), (packed_camera, packed_images, packed_points)
     for name, count, text, binary in zip(MODEL_FILES, counts, lines, parts, strict=True):
         packed = struct.pack("<Q", count) + b"".join(binary)
-        write_atomically(folder / BINARY_FOLDER / "0" / Path(name).with_suffix(".bin"), packed, RunError)
+        write_atomically(
+            folder / BINARY_FOLDER / "0" / Path(name).with_suffix(".bin"), packed, RunError
+        )
         write_atomically(folder / name, "\n".join([_HEADERS[name], *text, ""]), RunError)
 
 
@@ -114,7 +121,10 @@ def _images(
 
 
 def _points(
-    points_world: FloatArray, colours: NDArray[np.uint8], sightings: Sightings, of_frames: dict[int, NDArray[np.intp]]
+    points_world: FloatArray,
+    colours: NDArray[np.uint8],
+    sightings: Sightings,
+    of_frames: dict[int, NDArray[np.intp]],
 ) -> tuple[list[str], list[bytes]]:
     """A line a point with its track: numbers of images, and of corners in them; and the same in binary form."""
     tracks: dict[int, list[tuple[int, int]]] = {}
@@ -125,10 +135,14 @@ def _points(
     total = np.bincount(sightings.point, sightings.errors_px, count)
     errors = total / np.maximum(np.bincount(sightings.point, minlength=count), 1)
     lines, parts = [], []
-    for k, (place, colour, error) in enumerate(zip(points_world.tolist(), colours.tolist(), errors.tolist()), start=1):
+    for k, (place, colour, error) in enumerate(
+        zip(points_world.tolist(), colours.tolist(), errors.tolist()), start=1
+    ):
         track = tracks.get(k - 1, [])
         numbers = " ".join(f"{x:.9g}" for x in place), " ".join(map(str, colour)), f"{error:.4g}"
-        lines.append(" ".join((f"{k}", *numbers, *(f"{image} {corner}" for image, corner in track))))
+        lines.append(
+            " ".join((f"{k}", *numbers, *(f"{image} {corner}" for image, corner in track)))
+        )
         binary = struct.pack("<Q3d3BdQ", k, *place, *colour, error, len(track))
         parts.append(binary + np.array(track, "<u4").tobytes())
     return lines, parts

@@ -18,10 +18,18 @@ from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import RunError
 from slam.runtime.files import write_atomically
 
-_TYPES = {"double": "f8", "float": "f4", "uchar": "u1", "int": "i4", "uint": "u4"}  # that Open3D and we write
+_TYPES = {
+    "double": "f8",
+    "float": "f4",
+    "uchar": "u1",
+    "int": "i4",
+    "uint": "u4",
+}  # that Open3D and we write
 _NAMES = {kind: name for name, kind in _TYPES.items()}
 _AXES, _NORMALS, _COLOURS = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
-R_UP_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # x right, y ahead, z up
+R_UP_WORLD = np.array(
+    [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
+)  # x right, y ahead, z up
 _TRIANGLE = np.dtype([("count", "u1"), ("vertices", "<u4", (3,))])
 
 
@@ -47,7 +55,11 @@ class Ply:
     def colours(self) -> NDArray[np.uint8]:
         """RGB ``(V, 3)``, a middle grey where the file has none."""
         colours = self.columns(_COLOURS)
-        return np.full((len(self.vertices), 3), 128, np.uint8) if colours is None else colours.astype(np.uint8)
+        return (
+            np.full((len(self.vertices), 3), 128, np.uint8)
+            if colours is None
+            else colours.astype(np.uint8)
+        )
 
 
 def read_ply(path: Path) -> Ply:
@@ -67,7 +79,11 @@ def read_ply(path: Path) -> Ply:
         wrong = "a coordinate is not finite"
     elif faces is not None and (faces["count"] != 3).any():
         wrong = "a face has other than 3 vertices"
-    elif triangles is not None and triangles.size and not 0 <= triangles.min() <= triangles.max() < len(points):
+    elif (
+        triangles is not None
+        and triangles.size
+        and not 0 <= triangles.min() <= triangles.max() < len(points)
+    ):
         wrong = "a triangle has a vertex that does not exist"
     if wrong:
         raise RunError(f"{path} is no PLY that can be read ({wrong}): run the sequence again")
@@ -88,13 +104,17 @@ def _mapped(path: Path) -> dict[str, NDArray[np.void]]:
             place += count * dtype.itemsize
             if not start <= place <= size:
                 raise ValueError(f"it announces {count} elements '{name}', more than it holds")
-            parts[name] = np.memmap(path, dtype, "r", start, (count,)) if count else np.empty(0, dtype)
+            parts[name] = (
+                np.memmap(path, dtype, "r", start, (count,)) if count else np.empty(0, dtype)
+            )
         corners = parts["face"].dtype.names if "face" in parts else ("vertices",)
         if place < size or "vertex" not in parts or "vertices" not in (corners or ()):
             raise ValueError("it is longer than its header states, or has no vertices")
         return parts
     except (OSError, ValueError, KeyError) as error:
-        raise RunError(f"{path} is no PLY that can be read ({error}): run the sequence again") from error
+        raise RunError(
+            f"{path} is no PLY that can be read ({error}): run the sequence again"
+        ) from error
 
 
 def rotated(ply: Ply, R_up_world: FloatArray) -> Ply:
@@ -132,8 +152,15 @@ def write_ply_pieces(
         triangles: number of triangles; None for a cloud.
         triangle_pieces: arrays ``(t, 3)`` of indices into all vertices.
     """
-    lines = ["ply", "format binary_little_endian 1.0", "comment Created by erfsfm-slam", f"element vertex {vertices}"]
-    lines += [f"property {_NAMES[vertex_type[name].str[1:]]} {name}" for name in vertex_type.names or ()]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment Created by erfsfm-slam",
+        f"element vertex {vertices}",
+    ]
+    lines += [
+        f"property {_NAMES[vertex_type[name].str[1:]]} {name}" for name in vertex_type.names or ()
+    ]
     if triangles is not None:
         lines += [f"element face {triangles}", "property list uchar uint vertex_indices"]
 

@@ -29,7 +29,9 @@ logger = logging.getLogger(__name__)
 # columns of a row by format: KITTI's of 3x4 and of 4x4 with a frame number or without, TUM's without a stamp last
 _COLUMNS = {"kitti": (12, 13, 16, 17), "tum": (8, 7)}
 # a TartanAir camera looks along x, with y to the right and z down
-_T_TARTAN_CAMERA = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
+_T_TARTAN_CAMERA = np.array(
+    [[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64
+)
 _WANTED = "a pose a row"
 # Largest |R R^T - I| or | |q| - 1 | that counts as rounding in a file and is repaired.
 _ROTATION_TOLERANCE = 1e-3
@@ -41,7 +43,10 @@ _LEAST_OF_OTHER_UNIT = 10  # matching rows, which are by chance
 _LONE_PERIOD_S = 0.04  # of a trajectory of one pose
 _LEAST_IN_ORDER = 0.75  # share of the rows; with fewer, nobody knows which of them are out of order
 _MOST_PLACES_LATE = 5
-_FRACTIONS = {13: 3, 16: 6}  # digits of milli- and microseconds since 1970, and how many are behind the point
+_FRACTIONS = {
+    13: 3,
+    16: 6,
+}  # digits of milli- and microseconds since 1970, and how many are behind the point
 _NANOSECOND_DIGITS = 15  # at least
 
 
@@ -127,7 +132,9 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
     if format not in ("auto", *_COLUMNS):
         raise TrajectoryError(f"unknown trajectory format '{format}'; use auto, kitti or tum")
     bad = BadRows(path, TrajectoryError)
-    lines, rows, numbers = _read_numbers(path, _COLUMNS.get(format, _COLUMNS["kitti"] + _COLUMNS["tum"]), bad)
+    lines, rows, numbers = _read_numbers(
+        path, _COLUMNS.get(format, _COLUMNS["kitti"] + _COLUMNS["tum"]), bad
+    )
     columns, is_finite = numbers.shape[1], np.asarray(np.isfinite(numbers).all(axis=1))
     checks: list[tuple[Any, str]] = [(is_finite, "a number is not finite")]
     numbers = np.where(is_finite[:, None], numbers, 0.0)
@@ -138,13 +145,17 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
         is_unit = np.abs(np.linalg.norm(numbers[:, -4:], axis=1) - 1.0) < _ROTATION_TOLERANCE
         checks.append((is_unit, "the quaternion does not have length 1"))
         quaternions_xyzw = np.where(is_unit[:, None], numbers[:, -4:], [0.0, 0.0, 0.0, 1.0])
-        T_world_camera = se3.make(Rotation.from_quat(quaternions_xyzw).as_matrix(), numbers[:, -7:-4])
+        T_world_camera = se3.make(
+            Rotation.from_quat(quaternions_xyzw).as_matrix(), numbers[:, -7:-4]
+        )
     if columns == 7:
         T_world_camera = _T_TARTAN_CAMERA.T @ T_world_camera @ _T_TARTAN_CAMERA
     is_near = (np.abs(T_world_camera[:, :3, 3]) <= _FARTHEST).all(axis=1)
     checks.append((is_near, f"a position is farther than {_FARTHEST:g}"))
     R = T_world_camera[:, :3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):  # an overflow becomes NaN, which fails the check
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # an overflow becomes NaN, which fails the check
         deviation = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
         is_rotation = (deviation < _ROTATION_TOLERANCE) & (np.linalg.det(R) > 0)
     checks.append((is_rotation, "the 3x3 part is not a rotation matrix"))
@@ -171,7 +182,9 @@ def write_tum(path: Path | str, trajectory: Trajectory) -> None:
     poses = translations_and_quaternions(trajectory.T_world_camera)
     stamps = (np.format_float_positional(stamp, min_digits=9) for stamp in trajectory.stamps)
     lines = (f"{stamp} {_row(pose)}\n" for stamp, pose in zip(stamps, poses))
-    write_atomically(Path(path), "".join(["# timestamp tx ty tz qx qy qz qw\n", *lines]), TrajectoryError)
+    write_atomically(
+        Path(path), "".join(["# timestamp tx ty tz qx qy qz qw\n", *lines]), TrajectoryError
+    )
 
 
 def translations_and_quaternions(T_a_b: FloatArray) -> FloatArray:
@@ -206,14 +219,18 @@ def associate(
     rows_estimate, rows_reference = nearest_pairs(estimate.stamps, reference.stamps, within_s)
     cure = other_unit(estimate.stamps, reference.stamps)
     if not rows_estimate.size or (cure and len(rows_estimate) < _LEAST_OF_OTHER_UNIT):
-        ours, theirs = (f"{each.stamps[0]:.3f} to {each.stamps[-1]:.3f} s" for each in (estimate, reference))
+        ours, theirs = (
+            f"{each.stamps[0]:.3f} to {each.stamps[-1]:.3f} s" for each in (estimate, reference)
+        )
         raise TrajectoryError(
             f"no time stamps match within {tolerance_s:.3g} s: the estimate covers {ours} and the reference {theirs}; "
             f"{cure or 'bring both to the same clock'}"
         )
     expected = min(len(estimate), len(reference))
     if rows_estimate.size < 0.9 * expected:
-        logger.warning("only %d of %d poses have a matching time stamp", rows_estimate.size, expected)
+        logger.warning(
+            "only %d of %d poses have a matching time stamp", rows_estimate.size, expected
+        )
     pair = estimate.select(rows_estimate), reference.select(rows_reference)
     apart = np.abs(pair[0].stamps - pair[1].stamps).max()
     if apart <= _SAME_STAMP * min(_period_s(estimate), _period_s(reference)):
@@ -232,7 +249,9 @@ def other_unit(stamps: FloatArray, others: FloatArray) -> str | None:
     if power not in _UNITS or abs(abs(thousands) - power) > _UNIT_TOLERANCE:
         return None
     longer = max(stamps, others, key=np.ptp)
-    return f"stamps up to {longer[-1]:.0f} look like {_UNITS[power]}: divide them by {1000**power:.0e}"
+    return (
+        f"stamps up to {longer[-1]:.0f} look like {_UNITS[power]}: divide them by {1000**power:.0e}"
+    )
 
 
 def _of_frames(trajectory: Trajectory, start: int, stop: int) -> Trajectory:
@@ -242,12 +261,22 @@ def _of_frames(trajectory: Trajectory, start: int, stop: int) -> Trajectory:
         numbers = numbers + start
     chosen = (numbers >= start) & (numbers < stop)
     if not chosen.any():
-        raise TrajectoryError(f"there are no poses of frames {start}:{stop}, only {numbers[0]} to {numbers[-1]}")
-    return Trajectory(numbers[chosen].astype(np.float64), trajectory.T_world_camera[chosen], timed=False, numbered=True)
+        raise TrajectoryError(
+            f"there are no poses of frames {start}:{stop}, only {numbers[0]} to {numbers[-1]}"
+        )
+    return Trajectory(
+        numbers[chosen].astype(np.float64),
+        trajectory.T_world_camera[chosen],
+        timed=False,
+        numbered=True,
+    )
 
 
 def _same_frames(estimate: Trajectory, reference: Trajectory) -> tuple[Trajectory, Trajectory]:
-    if not (estimate.numbered or reference.numbered) and estimate.frame_count != reference.frame_count:
+    if (
+        not (estimate.numbered or reference.numbered)
+        and estimate.frame_count != reference.frame_count
+    ):
         raise TrajectoryError(
             f"the estimate has {estimate.frame_count} poses and the reference {reference.frame_count}; files without "
             "time stamps are compared row by row: give the frames of the estimate with --frames A:B and "
@@ -258,7 +287,9 @@ def _same_frames(estimate: Trajectory, reference: Trajectory) -> tuple[Trajector
         return estimate, reference
     _, rows_estimate, rows_reference = np.intersect1d(ours, theirs, return_indices=True)
     if not rows_estimate.size:
-        raise TrajectoryError("no frame numbers of the estimate are rows of the reference: give both from frame 0")
+        raise TrajectoryError(
+            "no frame numbers of the estimate are rows of the reference: give both from frame 0"
+        )
     return estimate.select(rows_estimate), reference.select(rows_reference)
 
 
@@ -271,7 +302,9 @@ def _period_s(trajectory: Trajectory) -> float:
     return float(np.median(np.diff(trajectory.stamps))) if len(trajectory) > 1 else _LONE_PERIOD_S
 
 
-def nearest_pairs(a: FloatArray, b: FloatArray, within_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def nearest_pairs(
+    a: FloatArray, b: FloatArray, within_s: float
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows of two increasing series of stamps that are each other's nearest and at most ``within_s`` apart."""
     nearest_b, nearest_a = nearest_stamps(a, b), nearest_stamps(b, a)
     rows_a = np.arange(len(a))
@@ -301,7 +334,9 @@ def _read_numbers(
     for row, (line, words) in enumerate(table):
         odd = next((word for word in words if not is_number(word)), None)
         if len(words) != columns:
-            bad.add(line, _other_columns(len(words), columns if counts[columns] else forms[0], forms))
+            bad.add(
+                line, _other_columns(len(words), columns if counts[columns] else forms[0], forms)
+            )
         elif odd is not None:
             hint = "; decimals are written with a point" if is_number(odd.replace(",", ".")) else ""
             bad.add(line, f"not a number: {odd!r}{hint}")
@@ -314,7 +349,9 @@ def _read_numbers(
 
 def _words(line: str) -> list[str]:
     """The words of a row; of EuRoC's the stamp in seconds and the quaternion as TUM has them."""
-    separators = [separator for separator in ";," if line.count(separator) >= _COLUMNS["tum"][1] - 1]
+    separators = [
+        separator for separator in ";," if line.count(separator) >= _COLUMNS["tum"][1] - 1
+    ]
     words = [word.strip() for word in line.split(separators[0])] if separators else line.split()
     if any(" " in word for word in words):  # a comma for the point
         separators, words = [], line.split()
@@ -355,7 +392,9 @@ class BadRows:
         """Leave out the row on this line."""
         self._reasons.setdefault(line, reason)
 
-    def without(self, checks: Sequence[tuple[Any, str]], lines: NDArray[np.intp], *columns: Any) -> tuple[Any, ...]:
+    def without(
+        self, checks: Sequence[tuple[Any, str]], lines: NDArray[np.intp], *columns: Any
+    ) -> tuple[Any, ...]:
         """Lines ``(N,)`` and columns ``(N, ...)`` of the rows that pass all checks ``(N,)``; others have the reason."""
         for is_good, reason in checks:
             for line in lines[~is_good].tolist():
@@ -373,19 +412,28 @@ class BadRows:
         """
         order = np.argsort(stamps, kind="stable")
         has_no_order = len(order) > 1 and np.mean(np.diff(stamps) < 0) > 1 - _LEAST_IN_ORDER
-        bad = np.abs(order - np.arange(len(order))) > (len(order) if has_no_order else _MOST_PLACES_LATE)
+        bad = np.abs(order - np.arange(len(order))) > (
+            len(order) if has_no_order else _MOST_PLACES_LATE
+        )
         bad[1:] |= np.diff(stamps[order]) == 0
         for line in lines[order[bad]].tolist():
             self.add(line, f"{what} must increase")
         if bad.sum() > (1 - _LEAST_IN_ORDER) * len(bad):
             line = int(lines[order[bad]].min())
-            raise self._error(f"{self._path}, line {line}: {what} must increase; sort the rows, a series a file")
+            raise self._error(
+                f"{self._path}, line {line}: {what} must increase; sort the rows, a series a file"
+            )
         good = order[~bad]
         self.say(len(good), wanted)
         late = np.flatnonzero(np.diff(good) < 0)
         if len(late):
             line = int(lines[good[late + 1]].min())
-            logger.warning("%s: %s are not in order, first on line %d: the rows are sorted", self._path, what, line)
+            logger.warning(
+                "%s: %s are not in order, first on line %d: the rows are sorted",
+                self._path,
+                what,
+                line,
+            )
         return good
 
     def say(self, left: int, wanted: str) -> None:
@@ -397,7 +445,12 @@ class BadRows:
         if self._reasons:
             total = left + len(self._reasons)
             logger.warning(
-                "%s: %d of %d rows are left out; line %d: %s", self._path, len(self._reasons), total, line, reason
+                "%s: %d of %d rows are left out; line %d: %s",
+                self._path,
+                len(self._reasons),
+                total,
+                line,
+                reason,
             )
 
 

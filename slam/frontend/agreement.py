@@ -34,9 +34,16 @@ _TELLING_FOCAL = 0.1  # largest sigma of one that says something
 _USUAL_SUPPORT, _SUPPORT_SPREAD = 0.6, 0.13
 _WEAK_SUPPORT, _LEAST_WEAK = 0.2, 10  # and frames in a row that are a doubt
 _ON_ROAD, _ON_ROAD_SPREAD = 1.0, 0.2
-_FAR_SPREAD, _FAR_CORNERS = 0.18, 0.05  # of the logarithm; and least corners over the most of a distance
+_FAR_SPREAD, _FAR_CORNERS = (
+    0.18,
+    0.05,
+)  # of the logarithm; and least corners over the most of a distance
 _CONTRADICTED_SPREAD = 0.007
-_LEAST_MOVED, _ALONG, _ASIDE_SPREAD = 0.1, np.cos(np.deg2rad(20.0)), 0.01  # of long steps; of their directions
+_LEAST_MOVED, _ALONG, _ASIDE_SPREAD = (
+    0.1,
+    np.cos(np.deg2rad(20.0)),
+    0.01,
+)  # of long steps; of their directions
 _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS = 0.03, 3.0
 # of `share_right`, by tools/fit_confidence.py of commit 669cc2b1
 CONFIDENCE = (0.97, 3.0, 5.5)
@@ -62,7 +69,11 @@ class Agreement:
 
     def said(self) -> Agreement:
         """The same, in the log; as a warning where it is doubtful."""
-        text = str(self) if self.sigmas > DOUBTFUL else f"{self.source} agrees with {self.beside}: {self.figure}"
+        text = (
+            str(self)
+            if self.sigmas > DOUBTFUL
+            else f"{self.source} agrees with {self.beside}: {self.figure}"
+        )
         # as a format: where warnings of a kind are counted, each is of its own
         logger.log(logging.WARNING if self.sigmas > DOUBTFUL else logging.INFO, text)
         return self
@@ -76,22 +87,35 @@ class Agreement:
 
 def of_height(source: str, implied_m: float, stated_m: float | None, spread: float) -> Agreement:
     """By the camera's height above the road that lengths of the source imply, with the relative spread of the road."""
-    wanted, noise = (_USUAL_HEIGHT_M, np.log(_USUAL_FACTOR)) if stated_m is None else (stated_m, _HEIGHT)
+    wanted, noise = (
+        (_USUAL_HEIGHT_M, np.log(_USUAL_FACTOR)) if stated_m is None else (stated_m, _HEIGHT)
+    )
     sigmas = abs(np.log(max(implied_m, 1e-12) / wanted)) / np.hypot(noise, spread)
     told = "" if stated_m is None else f", and {stated_m:g} m are stated"
-    return Agreement(source, float(sigmas), f"by it the camera is {implied_m:.3g} m above the road{told}")
+    return Agreement(
+        source, float(sigmas), f"by it the camera is {implied_m:.3g} m above the road{told}"
+    )
 
 
-def of_steps(source: str, steps: Sequence[RelativePose], motions: Mapping[Ends, Motion]) -> Agreement | None:
+def of_steps(
+    source: str, steps: Sequence[RelativePose], motions: Mapping[Ends, Motion]
+) -> Agreement | None:
     """By rotations and directions of the steps that both measured; None where these are few."""
-    pairs = [(step, motions[step.ends].relative_pose.T_from_to) for step in steps if step.ends in motions]
+    pairs = [
+        (step, motions[step.ends].relative_pose.T_from_to) for step in steps if step.ends in motions
+    ]
     if len(pairs) < _LEAST:
         return None
-    by_source, by_images = np.array([step.T_from_to for step, _ in pairs]), np.array([T for _, T in pairs])
+    by_source, by_images = (
+        np.array([step.T_from_to for step, _ in pairs]),
+        np.array([T for _, T in pairs]),
+    )
     noise = np.array([step.sigmas for step, _ in pairs])
     turned = rotation_angle((invert(by_source) @ by_images)[:, :3, :3])
     lengths = [np.linalg.norm(T[:, :3, 3], axis=1) for T in (by_source, by_images)]
-    along = np.einsum("ni,ni->n", by_source[:, :3, 3], by_images[:, :3, 3]) / np.maximum(lengths[0] * lengths[1], 1e-12)
+    along = np.einsum("ni,ni->n", by_source[:, :3, 3], by_images[:, :3, 3]) / np.maximum(
+        lengths[0] * lengths[1], 1e-12
+    )
     apart = np.arccos(np.clip(along, -1, 1))
     of_direction = np.hypot(_DIRECTION_RAD, np.arctan2(noise[:, 3:].max(axis=1), lengths[0]))
     sigmas = max(
@@ -99,14 +123,24 @@ def of_steps(source: str, steps: Sequence[RelativePose], motions: Mapping[Ends, 
         float(np.median(apart / of_direction)),
     )
     degrees = np.rad2deg([np.median(turned), np.median(apart)])
-    return Agreement(source, sigmas, f"its steps turn {degrees[0]:.2f} and point {degrees[1]:.1f} degrees off, median")
+    return Agreement(
+        source,
+        sigmas,
+        f"its steps turn {degrees[0]:.2f} and point {degrees[1]:.1f} degrees off, median",
+    )
 
 
-def of_positions(source: str, distances: FloatArray, sigmas: FloatArray, path_m: float) -> Agreement:
+def of_positions(
+    source: str, distances: FloatArray, sigmas: FloatArray, path_m: float
+) -> Agreement:
     """By distances ``(M,)`` of the aligned path from its positions with ``sigmas`` ``(M,)``, metres."""
     noise = np.hypot(sigmas, _DRIFT * path_m)
     median = float(np.median(distances))
-    return Agreement(source, mad_sigma(distances / noise), f"its positions lie {median:.1f} m off the path, median")
+    return Agreement(
+        source,
+        mad_sigma(distances / noise),
+        f"its positions lie {median:.1f} m off the path, median",
+    )
 
 
 def of_directions(T_odometry: FloatArray) -> Agreement:
@@ -126,10 +160,14 @@ def of_depth(source: str, error: DepthError) -> Agreement | None:
     spread = error.total_spread
     if spread is None:
         return None
-    return Agreement(source, spread / _DEPTH, f"its ratio to triangulated depth varies by {100 * spread:.0f} %")
+    return Agreement(
+        source, spread / _DEPTH, f"its ratio to triangulated depth varies by {100 * spread:.0f} %"
+    )
 
 
-def of_images(drive: Drive, camera: Intrinsics, contradicted: Sequence[Ends], needs_road: bool) -> list[Agreement]:
+def of_images(
+    drive: Drive, camera: Intrinsics, contradicted: Sequence[Ends], needs_road: bool
+) -> list[Agreement]:
     """How far the images of a completed drive are from those of good drives, in the log too.
 
     Args:
@@ -139,7 +177,9 @@ def of_images(drive: Drive, camera: Intrinsics, contradicted: Sequence[Ends], ne
         needs_road: whether lengths are measured on the road.
     """
     frames, interpolated, guessed = len(drive), len(drive.interpolated), len(drive.segments) - 1
-    steps = 0 if drive.maps else len(triangulated(drive.steps))  # lengths are then those of the maps
+    steps = (
+        0 if drive.maps else len(triangulated(drive.steps))
+    )  # lengths are then those of the maps
     on_road = len(drive.road_steps)
     gaps = float(np.hypot(interpolated / frames / _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS * guessed))
     figure = f"{interpolated} of {frames} frames are interpolated"
@@ -147,8 +187,14 @@ def of_images(drive: Drive, camera: Intrinsics, contradicted: Sequence[Ends], ne
     found = [("gaps", gaps, figure)]
     if steps:
         figure = f"learned depth or the speed before contradict {len(contradicted)} of {steps}"
-        figure += f", which end at frames {named([last for _, last in contradicted])}" if contradicted else ""
-        found.append(("the length of steps", len(contradicted) / steps / _CONTRADICTED_SPREAD, figure))
+        figure += (
+            f", which end at frames {named([last for _, last in contradicted])}"
+            if contradicted
+            else ""
+        )
+        found.append(
+            ("the length of steps", len(contradicted) / steps / _CONTRADICTED_SPREAD, figure)
+        )
     corners_were_asked = bool(drive.motions or drive.failures)
     if corners_were_asked and (support := drive.support) is not None:
         found.append(("the overlap of images", *_overlap(support)))
@@ -160,10 +206,15 @@ def of_images(drive: Drive, camera: Intrinsics, contradicted: Sequence[Ends], ne
     if needs_road and steps and too_far is not None:
         figure = f"it is up to {100 * np.expm1(too_far):.0f} % farther than triangulated, as where a lens zooms"
         found.append(("learned depth far away", too_far / _FAR_SPREAD, figure))
-    agreements = [Agreement(source, sigmas, figure, "good drives") for source, sigmas, figure in found]
+    agreements = [
+        Agreement(source, sigmas, figure, "good drives") for source, sigmas, figure in found
+    ]
     by_corners = of_focal_length(drive.focal_length, camera)
     agreements += [] if by_corners is None else [by_corners]
-    return [agreements[0], *(each.said() for each in agreements[1:])]  # gaps and segments were said by their frames
+    return [
+        agreements[0],
+        *(each.said() for each in agreements[1:]),
+    ]  # gaps and segments were said by their frames
 
 
 def _overlap(support: FloatArray) -> tuple[float, str]:
@@ -194,7 +245,9 @@ def of_focal_length(found: FocalLength, camera: Intrinsics) -> Agreement | None:
     return Agreement("the focal length", sigmas, figure) if figure else None
 
 
-def confidence(agreements: Iterable[Agreement], is_metric: bool, is_carried: bool) -> float | Failed:
+def confidence(
+    agreements: Iterable[Agreement], is_metric: bool, is_carried: bool
+) -> float | Failed:
     """The share of drives with as large a contradiction that err by at most 1 % of their path; where known of such."""
     if is_carried:
         return Failed("it is calibrated on roads, not for a camera that is carried")

@@ -20,7 +20,14 @@ from slam.frontend.drive import Drive, Segment
 from slam.frontend.factors import calibrate_network, equal_step, network_steps
 from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.road import with_slope
-from slam.frontend.visual.motion import Motion, RelativeRotation, Steps, path_between, shortest_by_start, triangulated
+from slam.frontend.visual.motion import (
+    Motion,
+    RelativeRotation,
+    Steps,
+    path_between,
+    shortest_by_start,
+    triangulated,
+)
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert, tangent
 from slam.runtime.errors import SlamError
 
@@ -43,7 +50,10 @@ _BLOCK = np.arange(9)
 
 
 def complete_drive(
-    drive: Drive, sources: int, map_poses: KeyframePoses = _NO_MAPS, joins: Sequence[TrackingEvent] = ()
+    drive: Drive,
+    sources: int,
+    map_poses: KeyframePoses = _NO_MAPS,
+    joins: Sequence[TrackingEvent] = (),
 ) -> Drive:
     """The drive with its gaps interpolated, its rotations smoothed, its road by its path, and its segments.
 
@@ -89,7 +99,10 @@ def find_cuts(
 
 
 def find_segments(
-    count: int, cuts: Collection[int], interpolated: Mapping[int, str], is_related: Callable[[int], bool]
+    count: int,
+    cuts: Collection[int],
+    interpolated: Mapping[int, str],
+    is_related: Callable[[int], bool],
 ) -> list[Segment]:
     """The segments of a drive of so many frames, by its cuts and its long gaps.
 
@@ -99,10 +112,20 @@ def find_segments(
     begins = {0: ""} | dict.fromkeys(between, "it shows another place than the frame before")
     ends = {count - 1} | {cut - 1 for cut in between}
     for first, last in runs(interpolated):
-        if last - first + 1 > _LONGEST_GAP and first > 0 and last + 1 < count and not is_related(last + 1):
+        if (
+            last - first + 1 > _LONGEST_GAP
+            and first > 0
+            and last + 1 < count
+            and not is_related(last + 1)
+        ):
             ends.add(first - 1)
-            begins[last + 1] = f"{last - first + 1} frames before it are interpolated: {interpolated[first]}"
-    return [Segment(first, last, begins[first]) for first, last in zip(sorted(begins), sorted(ends), strict=True)]
+            begins[last + 1] = (
+                f"{last - first + 1} frames before it are interpolated: {interpolated[first]}"
+            )
+    return [
+        Segment(first, last, begins[first])
+        for first, last in zip(sorted(begins), sorted(ends), strict=True)
+    ]
 
 
 def interpolate_gaps(
@@ -127,12 +150,22 @@ def interpolate_gaps(
     frozen, steps = _without_frozen(by_network, drive.steps, map_poses, repeated, new)
     frames = dict(unusable) | dict.fromkeys(frozen, "the image stands still while the camera moves")
     spans = ((s, {s.target, *s.sources}) for s in snippets)
-    trusted = [s for s, span in spans if not frozen & span and not any(min(span) < cut <= max(span) for cut in cuts)]
+    trusted = [
+        s
+        for s, span in spans
+        if not frozen & span and not any(min(span) < cut <= max(span) for cut in cuts)
+    ]
     filled = _filled(snippets, _completed(raw, range(count - 1)), count, sources)
-    by_image = {m.ends[0]: m.relative_pose.T_from_to for m in steps.values() if m.ends == (m.ends[0], m.ends[0] + 1)}
+    by_image = {
+        m.ends[0]: m.relative_pose.T_from_to
+        for m in steps.values()
+        if m.ends == (m.ends[0], m.ends[0] + 1)
+    }
     # snippets of frozen images alone are still the best estimate available
     known = calibration.scaled(network_steps(trusted)) | by_image or by_network
-    covered = {step for s in trusted for step in range(min(s.sources), max(s.sources))} | by_image.keys()
+    covered = {
+        step for s in trusted for step in range(min(s.sources), max(s.sources))
+    } | by_image.keys()
     loose = [step for step in range(count - 1) if step not in covered]
     motion = _completed(known, loose)
     for pose in _poses(steps):  # over gaps
@@ -143,7 +176,9 @@ def interpolate_gaps(
     gap_steps = []
     for step in loose:
         length = max(float(np.linalg.norm(motion[step][:3, 3])), typical, _SIGMA_FLOOR)
-        sigmas = np.repeat([np.deg2rad(_ROTATION_SIGMA_DEG), _TRANSLATION_RELATIVE_SIGMA * length], 3)
+        sigmas = np.repeat(
+            [np.deg2rad(_ROTATION_SIGMA_DEG), _TRANSLATION_RELATIVE_SIGMA * length], 3
+        )
         gap_steps.append(RelativePose(step, step + 1, motion[step], sigmas, INTERPOLATED_SOURCE))
     return replace(
         drive,
@@ -172,7 +207,9 @@ def _without_frozen(
     """
     frozen: set[int] = set()
     for first, last in runs(repeated):
-        before = [T for k, T in by_network.items() if first - 1 - _STEPS_OF_A_MOTION <= k < first - 1]
+        before = [
+            T for k, T in by_network.items() if first - 1 - _STEPS_OF_A_MOTION <= k < first - 1
+        ]
         following = next((k for k in range(last + 1, last + 2 + _LONGEST_DOUBT) if k in new), None)
         if not before or following is None:
             continue
@@ -206,7 +243,10 @@ def _completed(known: Mapping[int, FloatArray], steps: Collection[int]) -> dict[
     found = np.empty((len(unknown), 6))
     for row, step in enumerate(unknown):
         after = int(np.searchsorted(numbers, step))
-        around = slice(max(after - _STEPS_OF_A_MOTION, 0), after), slice(after, after + _STEPS_OF_A_MOTION)
+        around = (
+            slice(max(after - _STEPS_OF_A_MOTION, 0), after),
+            slice(after, after + _STEPS_OF_A_MOTION),
+        )
         ends = [(numbers[part], motion[part].mean(axis=0)) for part in around if len(numbers[part])]
         distances = np.array([np.abs(near - step).min() for near, _ in ends], np.float64)[::-1]
         found[row] = distances @ np.array([mean for _, mean in ends]) / distances.sum()
@@ -244,7 +284,9 @@ def smooth_rotations(steps: Steps, relative_rotations: Sequence[RelativeRotation
     usable = [(rotation, path) for rotation, path in paths if path]
     if not usable:
         return steps
-    T_current_previous = invert(np.array([motion.relative_pose.T_from_to for motion in motions.values()]))
+    T_current_previous = invert(
+        np.array([motion.relative_pose.T_from_to for motion in motions.values()])
+    )
     R_current_previous = dict(zip(motions, T_current_previous[:, :3, :3], strict=True))
     A, target = _equations(R_current_previous, usable)
     # relative rotations that overlap share their images: overlapping ones count as one
@@ -259,7 +301,9 @@ def smooth_rotations(steps: Steps, relative_rotations: Sequence[RelativeRotation
         weighted = A.multiply(weights[:, None]).T.tocsr()
         correction = np.atleast_1d(spsolve((weighted @ A + prior).tocsc(), weighted @ target))
     turns = correction.reshape(-1, 3)
-    T_current_previous[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix() @ T_current_previous[:, :3, :3]
+    T_current_previous[:, :3, :3] = (
+        Rotation.from_rotvec(turns).as_matrix() @ T_current_previous[:, :3, :3]
+    )
     covariances = np.array([motion.covariance for motion in motions.values()])
     moves = covariances[:, 3:, :3] @ np.linalg.solve(covariances[:, :3, :3], turns[:, :, None])
     directions = T_current_previous[:, :3, 3]
@@ -274,7 +318,8 @@ def smooth_rotations(steps: Steps, relative_rotations: Sequence[RelativeRotation
 
 
 def _equations(
-    R_current_previous: Mapping[Ends, FloatArray], usable: Sequence[tuple[RelativeRotation, list[Ends]]]
+    R_current_previous: Mapping[Ends, FloatArray],
+    usable: Sequence[tuple[RelativeRotation, list[Ends]]],
 ) -> tuple[csr_array, FloatArray]:
     """Whitened equations of all relative rotations in the corrections of steps: matrix and right side."""
     place = {ends: 3 * n for n, ends in enumerate(R_current_previous)}
@@ -290,5 +335,7 @@ def _equations(
     sigmas = np.array([rotation.sigmas for rotation, _ in usable])
     target = Rotation.from_matrix(np.array(R_residual)).as_rotvec() / sigmas
     shape = 3 * len(usable), 3 * len(place)
-    A = coo_array((np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
+    A = coo_array(
+        (np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=shape
+    )
     return A.tocsr(), target.ravel()

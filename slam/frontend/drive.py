@@ -146,7 +146,11 @@ class Drive:
         More in a row are a camera that stands. At the end of a drive nobody knows.
         """
         moving = set(self.moving).difference(self.interpolated)
-        few = [(first, last) for first, last in runs(self.repeated) if last - first < 2 and last < len(self) - 1]
+        few = [
+            (first, last)
+            for first, last in runs(self.repeated)
+            if last - first < 2 and last < len(self) - 1
+        ]
         return [k for first, last in few for k in range(first, last + 1) if k in moving]
 
     @property
@@ -156,11 +160,15 @@ class Drive:
 
     def last_step(self, index: int) -> Motion | None:
         """The step to one of the last frames, where image geometry measured it."""
-        return next((motion for motion in self.motions[-LAST_STEPS:] if motion.ends[1] == index), None)
+        return next(
+            (motion for motion in self.motions[-LAST_STEPS:] if motion.ends[1] == index), None
+        )
 
     def copy(self) -> Drive:
         """A snapshot: what is measured later is added to one of both alone."""
-        own: dict[str, Any] = {name: each.copy() for name, each in vars(self).items() if isinstance(each, list | dict)}
+        own: dict[str, Any] = {
+            name: each.copy() for name, each in vars(self).items() if isinstance(each, list | dict)
+        }
         return replace(self, **own)
 
     def since(self, first: int) -> Drive:
@@ -175,11 +183,17 @@ class Drive:
 
         def moved(motion: Motion) -> Motion:
             pose, (a, b) = motion.relative_pose, motion.ends
-            return replace(motion, relative_pose=replace(pose, from_index=a - first, to_index=b - first))
+            return replace(
+                motion, relative_pose=replace(pose, from_index=a - first, to_index=b - first)
+            )
 
         return Drive(
             snippets=[
-                replace(s, target=s.target - first, sources=tuple(source - first for source in s.sources))
+                replace(
+                    s,
+                    target=s.target - first,
+                    sources=tuple(source - first for source in s.sources),
+                )
                 for s in last(reversed(self.snippets), lambda s: min(s.sources))
             ],
             motions=[moved(motion) for motion in last(reversed(self.motions), lambda m: m.ends[0])],
@@ -191,9 +205,15 @@ class Drive:
                 replace(rotation, ends=(rotation.ends[0] - first, rotation.ends[1] - first))
                 for rotation in last(reversed(self.relative_rotations), lambda r: r.ends[0])
             ],
-            failures=[(a - first, b - first, why) for a, b, why in last(reversed(self.failures), lambda f: f[0])],
+            failures=[
+                (a - first, b - first, why)
+                for a, b, why in last(reversed(self.failures), lambda f: f[0])
+            ],
             roads=self.roads[first:],
-            unusable={k - first: why for k, why in last(reversed(self.unusable.items()), lambda item: item[0])},
+            unusable={
+                k - first: why
+                for k, why in last(reversed(self.unusable.items()), lambda item: item[0])
+            },
             repeated=[k - first for k in last(reversed(self.repeated), lambda k: k)],
         )
 
@@ -210,5 +230,7 @@ def frame_support(frames: range, motions: Iterable[Motion]) -> FloatArray:
 def named(frames: Collection[int]) -> str:
     """Stretches of frames in words, the first ten of them."""
     found = runs(frames)
-    words = [f"{first} to {last}" if last > first else str(first) for first, last in found[:_MOST_NAMED]]
+    words = [
+        f"{first} to {last}" if last > first else str(first) for first, last in found[:_MOST_NAMED]
+    ]
     return ", ".join(words) + ", ..." * (len(found) > _MOST_NAMED)

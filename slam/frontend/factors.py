@@ -22,12 +22,22 @@ from slam.frontend.keyframes.relative_poses import KeyframePoses, chained
 from slam.frontend.scale import Scale
 from slam.frontend.visual.motion import step_noise, triangulated
 from slam.geometry.robust import MAD_TO_SIGMA, running_median
-from slam.geometry.se3 import FloatArray, chain, compose, from_rotation_vector, invert, rigid, tangent
+from slam.geometry.se3 import (
+    FloatArray,
+    chain,
+    compose,
+    from_rotation_vector,
+    invert,
+    rigid,
+    tangent,
+)
 
 logger = logging.getLogger(__name__)
 NETWORK_SOURCE = "network"
 STUDENT_T_DOF = 12.0  # of the errors of measured steps: degrees of freedom of Student's t
-LEAST_PAIRS = 20  # steps that image geometry measured too, from which on unit and noise are measured
+LEAST_PAIRS = (
+    20  # steps that image geometry measured too, from which on unit and noise are measured
+)
 _NEAREST_PAIRS = 40  # in time, by which they are measured
 _LONGEST_PAIR = 4  # frames: as far as a snippet reaches
 _SHORTEST_PAIR = 0.1  # over the median length of a step: shorter ones say nothing about the unit
@@ -66,13 +76,18 @@ def make_factors(
         networks = [factor for factor in networks if factor.ends not in by_geometry]
     interpolated = [scale.scaled(pose) for pose in drive.gap_steps]
     by_network, interpolated, by_image = (
-        [pose for pose in poses if not maps.is_inside(pose)] for poses in (networks, interpolated, geometric)
+        [pose for pose in poses if not maps.is_inside(pose)]
+        for poses in (networks, interpolated, geometric)
     )
-    interpolated = join_gap_ends(interpolated, [*by_network, *by_image], by_keyframes, maps.segments)
+    interpolated = join_gap_ends(
+        interpolated, [*by_network, *by_image], by_keyframes, maps.segments
+    )
     return [*by_network, *interpolated, *lidar_steps, *by_image, *by_keyframes]
 
 
-def scaled_poses(poses: Sequence[RelativePose], maps: KeyframePoses, scale: Scale) -> list[RelativePose]:
+def scaled_poses(
+    poses: Sequence[RelativePose], maps: KeyframePoses, scale: Scale
+) -> list[RelativePose]:
     """Poses by keyframes in the unit of the scale: one factor for each map, in which lengths are consistent."""
     units = {}
     for segment in set(maps.segments.values()):
@@ -92,7 +107,9 @@ def chain_odometry(factors: Sequence[RelativePose], count: int) -> FloatArray:
     arriving: dict[int, RelativePose] = {}
     for factor in factors:
         first, last = factor.ends
-        if first < last and (last not in arriving or _precedence(factor) >= _precedence(arriving[last])):
+        if first < last and (
+            last not in arriving or _precedence(factor) >= _precedence(arriving[last])
+        ):
             arriving[last] = factor
     T_world_camera = np.tile(np.eye(4), (count, 1, 1))
     T_from_to = rigid(np.array([arriving[k].T_from_to for k in range(1, count)]).reshape(-1, 4, 4))
@@ -128,9 +145,14 @@ class NetworkCalibration:
     def over(self, depth_unit: FloatArray) -> str:
         """The unit over that of learned depth ``(N,)`` and the noise, for logs."""
         if not self.is_measured:
-            return f"fewer than {LEAST_PAIRS} steps measure its unit, that of learned depth is taken"
+            return (
+                f"fewer than {LEAST_PAIRS} steps measure its unit, that of learned depth is taken"
+            )
         least, usual, most = np.quantile(self.unit / depth_unit, (0.0, 0.5, 1.0))
-        rotation, translation = np.rad2deg(np.median(self.sigmas[:, :3])), np.median(self.sigmas[:, 5])
+        rotation, translation = (
+            np.rad2deg(np.median(self.sigmas[:, :3])),
+            np.median(self.sigmas[:, 5]),
+        )
         return (
             f"by {self.pairs} steps its unit is {usual:.2f} ({least:.2f} to {most:.2f}) of that of learned depth, and "
             f"its noise {rotation:.2f} degrees and {100 * translation:.0f} % of a step"
@@ -183,12 +205,16 @@ def calibrate_network(
     error = np.abs(tangent(invert(T_network[used]) @ T_geometric[used])) / reach[used]
     # the unit follows image geometry, and so shares its errors
     shared = np.array([p.sigmas for p in pairs])[used] / reach[used]
-    own, of_geometry = (_nearest_median(first[used], values, len(unit)) for values in (error, shared))
+    own, of_geometry = (
+        _nearest_median(first[used], values, len(unit)) for values in (error, shared)
+    )
     sigmas = np.hypot(MAD_TO_SIGMA * own, of_geometry)
     return NetworkCalibration(unit, np.maximum(sigmas, _LEAST_SIGMAS), int(used.sum()))
 
 
-def network_factors(steps: Mapping[int, FloatArray], calibration: NetworkCalibration) -> list[RelativePose]:
+def network_factors(
+    steps: Mapping[int, FloatArray], calibration: NetworkCalibration
+) -> list[RelativePose]:
     """A factor for every step ``T_k_next`` of the network, in the unit of the calibration."""
     if not steps:
         return []
@@ -202,7 +228,11 @@ def network_factors(steps: Mapping[int, FloatArray], calibration: NetworkCalibra
     factors = []
     for (k, T_k_next), length in zip(scaled.items(), reach, strict=True):
         sigmas = calibration.sigmas[k] * np.repeat([1.0, length], 3)
-        factors.append(RelativePose(k, k + 1, T_k_next, sigmas, NETWORK_SOURCE, widening * sigmas, STUDENT_T_DOF))
+        factors.append(
+            RelativePose(
+                k, k + 1, T_k_next, sigmas, NETWORK_SOURCE, widening * sigmas, STUDENT_T_DOF
+            )
+        )
     return factors
 
 
@@ -223,7 +253,10 @@ def chain_raw(snippets: Sequence[SnippetPoses], count: int) -> FloatArray:
 
 def _steps(snippet: SnippetPoses) -> dict[int, FloatArray]:
     T_target = snippet.T_target_camera
-    return {k: invert(T_target[k]) @ T_target[k + 1] for k in range(min(snippet.sources), max(snippet.sources))}
+    return {
+        k: invert(T_target[k]) @ T_target[k + 1]
+        for k in range(min(snippet.sources), max(snippet.sources))
+    }
 
 
 def _by_depth(depth_unit: FloatArray, pairs: int) -> NetworkCalibration:
@@ -263,11 +296,17 @@ def join_gap_ends(
     """
     T_map_camera = chained(by_map)
     loose = {pose.from_index: pose for pose in interpolated}
-    T_step = {pose.from_index: pose.T_from_to for pose in measured if pose.to_index == pose.from_index + 1}
+    T_step = {
+        pose.from_index: pose.T_from_to for pose in measured if pose.to_index == pose.from_index + 1
+    }
     T_step |= {first: pose.T_from_to for first, pose in loose.items()}
     for first, last in pairwise(sorted(maps)):
         steps = range(first, last)
-        if maps[first] != maps[last] or loose.keys().isdisjoint(steps) or not T_step.keys() >= set(steps):
+        if (
+            maps[first] != maps[last]
+            or loose.keys().isdisjoint(steps)
+            or not T_step.keys() >= set(steps)
+        ):
             continue
         begin, end = max(runs(loose.keys() & set(steps)), key=lambda run: run[1] - run[0])
         T_first_begin = reduce(np.matmul, (T_step[k] for k in range(first, begin)), np.eye(4))

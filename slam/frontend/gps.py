@@ -51,14 +51,18 @@ class GpsFixes:
         agreement: of the fixes with the last path that was located by them.
     """
 
-    def __init__(self, track: GpsTrack, frame_stamps: FloatArray, config: GpsConfig, mode: ScaleMode) -> None:
+    def __init__(
+        self, track: GpsTrack, frame_stamps: FloatArray, config: GpsConfig, mode: ScaleMode
+    ) -> None:
         """The fixes of a track between the first and the last of the frames' stamps ``(N,)``.
 
         Raises:
             SlamError: lengths are not in metres, or fewer than three fixes were taken during the drive.
         """
         if mode == "none":
-            raise SlamError("a GPS track is in metres: choose scale.mode=gps with it, or another mode in metres")
+            raise SlamError(
+                "a GPS track is in metres: choose scale.mode=gps with it, or another mode in metres"
+            )
         shifted = track.stamps + config.offset_s
         inside = (shifted >= frame_stamps[0]) & (shifted <= frame_stamps[-1])
         if inside.sum() < _LEAST_FIXES:
@@ -71,7 +75,9 @@ class GpsFixes:
         self.points = self.frame.points(track.places[inside])
         own = np.array([config.sigma_m, config.sigma_m, config.vertical_sigma_m])
         self.sigmas: FloatArray = own * track.dilution[inside][:, None]
-        self.widening = float(np.sqrt(max(config.correlation_s / float(np.median(np.diff(self.stamps))), 1.0)))
+        self.widening = float(
+            np.sqrt(max(config.correlation_s / float(np.median(np.diff(self.stamps))), 1.0))
+        )
         self.agreement: Agreement | None = None
         self._frame_stamps, self._give_lengths = frame_stamps, mode == "gps"
 
@@ -87,7 +93,9 @@ class GpsFixes:
         least = _LEAST_MOTION_SIGMAS * sigma
 
         def chords(span: int) -> tuple[FloatArray, FloatArray]:
-            by_gps, by_camera = (np.linalg.norm(p[span:] - p[:-span], axis=1) for p in (self.points, estimated))
+            by_gps, by_camera = (
+                np.linalg.norm(p[span:] - p[:-span], axis=1) for p in (self.points, estimated)
+            )
             return by_gps, by_camera
 
         tenth = max(len(estimated) // _CHORDS, 1)
@@ -104,7 +112,9 @@ class GpsFixes:
                 f"{lengths.max():.1f} m; gps.sigma_m may be smaller for a good receiver"
             )
         good = _GOOD_CHORD_SIGMAS * sigma
-        by_gps, by_camera = chords(next((s for s in spans if metres * np.median(chords(s)[1]) >= good), longest))
+        by_gps, by_camera = chords(
+            next((s for s in spans if metres * np.median(chords(s)[1]) >= good), longest)
+        )
         usable = metres * by_camera > least
         ratios = by_gps[usable] / by_camera[usable]
         value = float(np.median(ratios))
@@ -131,11 +141,15 @@ class GpsFixes:
             spread = (self.points - mean_enu).T @ (weights[:, None] * (camera - mean_world))
             R_enu_world = se3.nearest_rotation(spread + by_up)
             T_enu_world = se3.make(R_enu_world, mean_enu - R_enu_world @ mean_world)
-            whitened = np.linalg.norm((se3.apply(T_enu_world, camera) - self.points) / sigma, axis=1)
+            whitened = np.linalg.norm(
+                (se3.apply(T_enu_world, camera) - self.points) / sigma, axis=1
+            )
             weights = precision * np.minimum(1.0, _HUBER_K / np.maximum(whitened, 1e-9))
         return T_enu_world
 
-    def locate(self, T_world_camera: FloatArray, scale: ScaleEstimate | Failed) -> Location | Failed:
+    def locate(
+        self, T_world_camera: FloatArray, scale: ScaleEstimate | Failed
+    ) -> Location | Failed:
         """Where a trajectory ``(N, 4, 4)`` lies on the earth; a failure is logged, as that of its scale was.
 
         Raises:
@@ -176,7 +190,10 @@ class GpsFixes:
 
     def _camera(self, T_any_camera: FloatArray) -> FloatArray:
         """Positions of the camera ``(M, 3)`` at the fixes, from its poses ``(N, 4, 4)``."""
-        ways = (np.interp(self.stamps, self._frame_stamps, T_any_camera[:, axis, 3]) for axis in range(3))
+        ways = (
+            np.interp(self.stamps, self._frame_stamps, T_any_camera[:, axis, 3])
+            for axis in range(3)
+        )
         return np.column_stack(list(ways))
 
 
@@ -215,10 +232,15 @@ class LocalFrame:
         radius = np.hypot(x, y)
         parametric = np.arctan2(z * _A, radius * _B)
         latitude = np.arctan2(
-            z + _E2_SECOND * _B * np.sin(parametric) ** 3, radius - _E2 * _A * np.cos(parametric) ** 3
+            z + _E2_SECOND * _B * np.sin(parametric) ** 3,
+            radius - _E2 * _A * np.cos(parametric) ** 3,
         )
         normal = _A / np.sqrt(1.0 - _E2 * np.sin(latitude) ** 2)
-        height = radius * np.cos(latitude) + z * np.sin(latitude) - normal * (1.0 - _E2 * np.sin(latitude) ** 2)
+        height = (
+            radius * np.cos(latitude)
+            + z * np.sin(latitude)
+            - normal * (1.0 - _E2 * np.sin(latitude) ** 2)
+        )
         return np.column_stack([np.rad2deg(latitude), np.rad2deg(np.arctan2(y, x)), height])
 
 

@@ -32,7 +32,9 @@ _NOISE_CONTRAST = 0.3  # contrast after blurring over contrast before, below whi
 _STANDING_GREY, _MOVING_GREY = 0.7, 4.0
 _BRIGHT_GREY = 235.0  # the sky does not change where the camera sees white
 _STANDING_IMAGES, _REMEMBERED_IMAGES = 20, 50
-_REPEAT_DIFFERENCE = 0.1  # largest difference of a re-encoded copy to its image, over the mean image gradient
+_REPEAT_DIFFERENCE = (
+    0.1  # largest difference of a re-encoded copy to its image, over the mean image gradient
+)
 
 Verdict = Literal["new", "repeated"] | Failed
 _Layer = NDArray[np.float32]
@@ -88,9 +90,18 @@ class ImageGate:
         """
         before = self._shrunk
         if before is None or before.shape != shrunk.shape:
-            self._shrunk, self._difference, self._change, self._moved, self.standing = shrunk, 0.0, None, 0, None
+            self._shrunk, self._difference, self._change, self._moved, self.standing = (
+                shrunk,
+                0.0,
+                None,
+                0,
+                None,
+            )
             return "new"
-        is_exposed = abs(float(np.log((np.median(shrunk) + 1.0) / (np.median(before) + 1.0)))) > _EXPOSURE_STEP
+        is_exposed = (
+            abs(float(np.log((np.median(shrunk) + 1.0) / (np.median(before) + 1.0))))
+            > _EXPOSURE_STEP
+        )
         self.compared, self.exposed = self.compared + 1, self.exposed + is_exposed
         difference = _difference(before, shrunk)
         largest = max(_REPEAT_DIFFERENCE, _COPY_OVER_MOTION * self._difference)

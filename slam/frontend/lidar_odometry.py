@@ -84,7 +84,9 @@ def lidar_path(sequence: Sequence, progress: Progress = silent) -> LidarPath | F
         logger.warning("%s: they are left out", found)
     T_world_camera = T_camera_lidar @ np.stack(T_first_lidar) @ invert(T_camera_lidar)
     logger.info("kiss-icp registered %d scans", len(frames))
-    return LidarPath(np.array(frames, dtype=np.int64), invert(T_world_camera[0]) @ T_world_camera, unreadable)
+    return LidarPath(
+        np.array(frames, dtype=np.int64), invert(T_world_camera[0]) @ T_world_camera, unreadable
+    )
 
 
 def lidar_steps(path: LidarPath) -> list[RelativePose]:
@@ -93,7 +95,9 @@ def lidar_steps(path: LidarPath) -> list[RelativePose]:
     T_previous_current = invert(path.T_world_camera[:-1]) @ path.T_world_camera[1:]
     return [
         RelativePose(int(first), int(second), T, sigmas, LIDAR_SOURCE)
-        for first, second, T in zip(path.frames[:-1], path.frames[1:], T_previous_current, strict=True)
+        for first, second, T in zip(
+            path.frames[:-1], path.frames[1:], T_previous_current, strict=True
+        )
         if second == first + 1
     ]
 
@@ -107,7 +111,9 @@ def usable_steps(path: LidarPath | Failed | None, are_needed: bool) -> list[Rela
     steps = lidar_steps(path) if isinstance(path, LidarPath) else []
     reason = path.reason if isinstance(path, Failed) else "no two neighbouring scans can be read"
     if are_needed and not steps:
-        raise SlamError(f"scale.mode=lidar: {reason}: leave the setting out, or give a sequence with scans")
+        raise SlamError(
+            f"scale.mode=lidar: {reason}: leave the setting out, or give a sequence with scans"
+        )
     if isinstance(path, Failed):
         logger.warning("%s: the run goes on without LiDAR", reason)
     return steps

@@ -31,7 +31,9 @@ from slam.geometry.se3 import FloatArray, chain, invert, path_distance
 from slam.runtime.errors import Failed
 
 _LEVEL = np.array([0.0, 1.0, 0.0])
-_LENGTHS_HEIGHTS = np.geomspace(0.02, 2.5, 32, dtype=np.float32)  # searched; refinement converges between them
+_LENGTHS_HEIGHTS = np.geomspace(
+    0.02, 2.5, 32, dtype=np.float32
+)  # searched; refinement converges between them
 _CLIPPED_GREY = 8.0
 _ITERATIONS = 6
 _CONVERGED = 1e-3  # of the length, whose sigma is fifty times as large
@@ -47,7 +49,9 @@ _MIN_POINTS = 300  # least number of aligned pixels of a measurement
 _TILT_SIGMA_DEG = 0.07  # sigma of the ground plane's tilt against the direction of motion, degrees
 _MAX_TILT_DEG = 4.0  # largest tilt of the ground plane, degrees
 _MIN_CORRELATION = 0.3  # least correlation of the aligned pixels
-_MIN_GAIN = 0.25  # least fraction of the photometric error without motion that the alignment removes
+_MIN_GAIN = (
+    0.25  # least fraction of the photometric error without motion that the alignment removes
+)
 _REACH_HEIGHTS = 2.5  # of the path before and after a frame, in camera heights: 4 m of a car
 _USUAL_STEPS = 101  # whose median direction is the usual one
 _PITCH_SIGMA_DEG = 0.3  # of a car against its usual pitch, degrees
@@ -56,10 +60,15 @@ _PLANE_POINTS = 1500
 _LEAST_POINTS = 50
 _HYPOTHESES = 150
 _REWEIGHTINGS = 8
-_ROAD_ROWS = 0.35, 0.97  # top and bottom edge of the road, from horizon (0) to image bottom (1): above a bonnet
+_ROAD_ROWS = (
+    0.35,
+    0.97,
+)  # top and bottom edge of the road, from horizon (0) to image bottom (1): above a bonnet
 _ROAD_TOP_WIDTH = 0.16  # width of the top edge over that of the image
 _ROAD_BOTTOM_WIDTH = 0.5  # width of the bottom edge over that of the image
-_MAX_PLANE_TILT_DEG = 12.0  # largest angle between the plane's normal and the camera's y axis, degrees
+_MAX_PLANE_TILT_DEG = (
+    12.0  # largest angle between the plane's normal and the camera's y axis, degrees
+)
 _INLIER_RELATIVE_DEPTH = 0.05  # largest relative depth error of a plane inlier
 _MIN_INLIER_RATIO = 0.5  # least inlier ratio of a usable frame
 
@@ -104,7 +113,11 @@ class RoadHomography:
         self._directions: tuple[FloatArray, ...] = ()  # of motion, of the last steps
 
     def measure(
-        self, previous: Frame, current: Frame, T_previous_current: FloatArray, standing: Mask | None = None
+        self,
+        previous: Frame,
+        current: Frame,
+        T_previous_current: FloatArray,
+        standing: Mask | None = None,
     ) -> RoadStep | Failed:
         """Measure the length of a step whose rotation and direction are known.
 
@@ -135,16 +148,25 @@ class RoadHomography:
         return [_strip(camera, self._top_row, *shape, visible) for shape in _SHAPES]
 
     def _measured_on(
-        self, strip: _Strip, previous: Frame, current: Frame, T_unit: FloatArray, expected: FloatArray
+        self,
+        strip: _Strip,
+        previous: Frame,
+        current: Frame,
+        T_unit: FloatArray,
+        expected: FloatArray,
     ) -> RoadStep | Failed:
         if len(strip.rows) < _MIN_POINTS:
             return Failed("the image shows too little of the road")
         before, now = self._layers(previous), self._layers(current)
         plane = self._search(strip, before[0], now[0], T_unit, expected)
         for layer_before, layer_now in zip(before, now, strict=True):
-            step, correlation = self._refine(strip, layer_before, layer_now, T_unit, plane, expected)
+            step, correlation = self._refine(
+                strip, layer_before, layer_now, T_unit, plane, expected
+            )
             plane = step.plane
-        standing = _correlation(*(strip.local(fine[strip.rows, strip.columns, 0]) for _, fine in (before, now)))
+        standing = _correlation(
+            *(strip.local(fine[strip.rows, strip.columns, 0]) for _, fine in (before, now))
+        )
         length = float(np.linalg.norm(plane))
         deviation = float(np.arccos(np.clip(plane / length @ expected, -1.0, 1.0)))
         if not np.isfinite(length) or deviation > np.deg2rad(_MAX_TILT_DEG):
@@ -152,7 +174,9 @@ class RoadHomography:
         if correlation < _MIN_CORRELATION:
             return Failed(f"both images of the road do not correlate ({correlation:.2f})")
         if 1.0 - correlation > (1.0 - _MIN_GAIN) * (1.0 - standing):
-            return Failed(f"the image in front of the car stands still (correlation {standing:.2f})")
+            return Failed(
+                f"the image in front of the car stands still (correlation {standing:.2f})"
+            )
         return step
 
     def _layers(self, frame: Frame) -> list[_Layer]:
@@ -164,7 +188,9 @@ class RoadHomography:
             sigma_px = _gradual_px(self._intrinsics)
             ratio = max(int(sigma_px) // 2, 1)
             size = max(grey.shape[1] // ratio, 1), max(grey.shape[0] // ratio, 1)
-            small = cv2.GaussianBlur(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), (0, 0), sigma_px / ratio)
+            small = cv2.GaussianBlur(
+                cv2.resize(grey, size, interpolation=cv2.INTER_AREA), (0, 0), sigma_px / ratio
+            )
             local = grey - np.asarray(cv2.resize(small, grey.shape[::-1]), np.float32)
             coarse = cv2.GaussianBlur(local, (0, 0), max(0.004 * self._intrinsics.fx, 1.0))
             return [np.asarray(cv2.merge([layer, *slopes_of(layer)])) for layer in (coarse, grey)]
@@ -180,17 +206,30 @@ class RoadHomography:
         columns, rows = (np.asarray(side, np.float32).reshape(-1, u.shape[-1]) for side in (u, v))
         return np.asarray(cv2.remap(layer, columns, rows, cv2.INTER_LINEAR)).reshape(*u.shape, 3)
 
-    def _search(self, strip: _Strip, before: _Layer, now: _Layer, T_unit: FloatArray, normal: FloatArray) -> FloatArray:
+    def _search(
+        self, strip: _Strip, before: _Layer, now: _Layer, T_unit: FloatArray, normal: FloatArray
+    ) -> FloatArray:
         """The best of fixed lengths at the expected normal, on every third pixel of the coarse image."""
         rays, seen = strip.rays[:, ::3], now[strip.rows[::3], strip.columns[::3], 0]
         R, t, n = _single(T_unit[:3, :3], T_unit[:3, 3], normal)
         shift = np.outer(t, n @ rays)
-        difference = self._sampled(before, _ahead(R @ rays + _LENGTHS_HEIGHTS[:, None, None] * shift))[..., 0] - seen
+        difference = (
+            self._sampled(before, _ahead(R @ rays + _LENGTHS_HEIGHTS[:, None, None] * shift))[
+                ..., 0
+            ]
+            - seen
+        )
         costs = np.minimum(np.abs(difference), _CLIPPED_GREY).mean(axis=1)
         return np.asarray(_LENGTHS_HEIGHTS[int(np.argmin(costs))] * normal)
 
     def _refine(
-        self, strip: _Strip, before: _Layer, now: _Layer, T_unit: FloatArray, plane: FloatArray, expected: FloatArray
+        self,
+        strip: _Strip,
+        before: _Layer,
+        now: _Layer,
+        T_unit: FloatArray,
+        plane: FloatArray,
+        expected: FloatArray,
     ) -> tuple[RoadStep, float]:
         """Gauss-Newton with Cauchy weights on the plane ``m`` ``(3,)``; also the correlation of both images."""
         fx, fy, (tx, ty, tz) = self._intrinsics.fx, self._intrinsics.fy, T_unit[:3, 3].tolist()
@@ -225,16 +264,27 @@ def with_slope(road_steps: Mapping[Ends, RoadStep], steps: Steps) -> dict[Ends, 
     motions = {ends: motion for ends, motion in triangulated(steps).items() if ends in road_steps}
     if not motions:
         return dict(road_steps)
-    ratios = [motion.length_unscaled / road_steps[ends].length_heights for ends, motion in motions.items()]
+    ratios = [
+        motion.length_unscaled / road_steps[ends].length_heights for ends, motion in motions.items()
+    ]
     by_path = _path_directions(steps, _REACH_HEIGHTS * float(np.median(ratios)))
-    T_current_previous = invert(np.array([motion.relative_pose.T_from_to for motion in motions.values()]))
-    own = -T_current_previous[:, :3, 3] / np.linalg.norm(T_current_previous[:, :3, 3], axis=1, keepdims=True)
+    T_current_previous = invert(
+        np.array([motion.relative_pose.T_from_to for motion in motions.values()])
+    )
+    own = -T_current_previous[:, :3, 3] / np.linalg.norm(
+        T_current_previous[:, :3, 3], axis=1, keepdims=True
+    )
     usual = np.column_stack([running_median(axis, _USUAL_STEPS) for axis in own.T])
-    around = np.array([by_path.get(ends[1], often) for ends, often in zip(motions, usual, strict=True)])
+    around = np.array(
+        [by_path.get(ends[1], often) for ends, often in zip(motions, usual, strict=True)]
+    )
     noise = _OF_PATH * mad_sigma((own - around)[:, 1])
     share = 1.0 / (1.0 + (noise / np.deg2rad(_PITCH_SIGMA_DEG)) ** 2)
     directions = zip(motions, usual + share * (around - usual), strict=True)
-    return {**road_steps, **{ends: road_steps[ends].along(direction) for ends, direction in directions}}
+    return {
+        **road_steps,
+        **{ends: road_steps[ends].along(direction) for ends, direction in directions},
+    }
 
 
 def _path_directions(steps: Steps, reach: float) -> dict[int, FloatArray]:
@@ -248,7 +298,9 @@ def _path_directions(steps: Steps, reach: float) -> dict[int, FloatArray]:
         T = chain(np.array([steps[ends].relative_pose.T_from_to for ends in run]))
         places = path_distance(T)
         behind, ahead = (
-            np.column_stack([np.interp(places + sign * reach, places, T[:, axis, 3]) for axis in range(3)])
+            np.column_stack(
+                [np.interp(places + sign * reach, places, T[:, axis, 3]) for axis in range(3)]
+            )
             for sign in (-1, 1)
         )
         chords = np.einsum("nba,nb->na", T[:, :3, :3], ahead - behind)
@@ -283,7 +335,12 @@ class _Strip:
 
 
 def _strip(
-    intrinsics: Intrinsics, top_row: int, far: float, half_width: float, relative_sigma: float, visible: Mask
+    intrinsics: Intrinsics,
+    top_row: int,
+    far: float,
+    half_width: float,
+    relative_sigma: float,
+    visible: Mask,
 ) -> _Strip:
     """The strip of a length and half width in camera heights."""
     v, u = np.mgrid[top_row : intrinsics.height, : intrinsics.width]
@@ -315,7 +372,9 @@ def _normal_along(direction: FloatArray) -> FloatArray:
     return np.asarray(normal / np.linalg.norm(normal))
 
 
-def _solved(information: FloatArray, right: FloatArray, normal: FloatArray, length: float) -> FloatArray:
+def _solved(
+    information: FloatArray, right: FloatArray, normal: FloatArray, length: float
+) -> FloatArray:
     """The plane ``m`` ``(3,)`` of normal equations and an expected normal, at about that length."""
     across = np.eye(3) - np.outer(normal, normal)
     prior = across / (np.deg2rad(_TILT_SIGMA_DEG) * max(length, 1e-6)) ** 2
@@ -351,9 +410,13 @@ class GroundPlaneFitter:
         # rows, columns (P,) and rays (P, 3) of about so many pixels; the horizon is taken at cy (a level camera)
         horizon, bottom = intrinsics.cy, intrinsics.height - 1.0
         top_row, bottom_row = (horizon + share * (bottom - horizon) for share in _ROAD_ROWS)
-        area = intrinsics.width * (bottom_row - top_row) * (_ROAD_TOP_WIDTH + _ROAD_BOTTOM_WIDTH) / 2
+        area = (
+            intrinsics.width * (bottom_row - top_row) * (_ROAD_TOP_WIDTH + _ROAD_BOTTOM_WIDTH) / 2
+        )
         step = max(1.0, float(np.sqrt(max(area, 1.0) / _PLANE_POINTS)))
-        rows_seen = np.unique(np.clip(np.arange(top_row, bottom_row, step), 0, bottom).astype(np.int64))
+        rows_seen = np.unique(
+            np.clip(np.arange(top_row, bottom_row, step), 0, bottom).astype(np.int64)
+        )
         rows, columns = [], []
         for row in rows_seen:
             share = (row - top_row) / (bottom_row - top_row)
@@ -380,14 +443,20 @@ class GroundPlaneFitter:
         rays, inverse_depth = self._rays[usable], inverse_depth[usable]  # (P, 3), (P,)
         scaled_normal = _ransac(rays, inverse_depth, self._seed)
         if scaled_normal is None:
-            return Failed(f"no plane within {_MAX_PLANE_TILT_DEG:g} deg of level in front of the car")
+            return Failed(
+                f"no plane within {_MAX_PLANE_TILT_DEG:g} deg of level in front of the car"
+            )
         scaled_normal = _reweighted(rays, inverse_depth, scaled_normal)
         height = 1.0 / float(np.linalg.norm(scaled_normal))
         inlier_ratio = float(_inliers(rays, inverse_depth, scaled_normal[None])[0].mean())
         if scaled_normal[1] * height < np.cos(np.deg2rad(_MAX_PLANE_TILT_DEG)):
-            return Failed(f"the plane in front of the car is tilted by more than {_MAX_PLANE_TILT_DEG:g} deg")
+            return Failed(
+                f"the plane in front of the car is tilted by more than {_MAX_PLANE_TILT_DEG:g} deg"
+            )
         if inlier_ratio < _MIN_INLIER_RATIO:
-            return Failed(f"only {inlier_ratio:.0%} of the pixels in front of the car lie on one plane")
+            return Failed(
+                f"only {inlier_ratio:.0%} of the pixels in front of the car lie on one plane"
+            )
         return height
 
 
@@ -399,7 +468,9 @@ def _ransac(rays: FloatArray, inverse_depth: FloatArray, seed: int) -> FloatArra
     solvable = np.abs(np.linalg.det(minimal)) > 1e-6
     if not solvable.any():
         return None
-    planes = np.linalg.solve(minimal[solvable], inverse_depth[samples[solvable]][..., None])[..., 0]  # (S, 3)
+    planes = np.linalg.solve(minimal[solvable], inverse_depth[samples[solvable]][..., None])[
+        ..., 0
+    ]  # (S, 3)
     level = planes[:, 1] > np.cos(np.deg2rad(_MAX_PLANE_TILT_DEG)) * np.linalg.norm(planes, axis=1)
     if not level.any():
         return None

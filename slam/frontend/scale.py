@@ -34,7 +34,9 @@ from slam.runtime.errors import Failed, SlamError
 LengthUnit = Literal["metres", "camera heights", "no metric unit", "the networks' own unit"]
 
 logger = logging.getLogger(__name__)
-_LEAST_ROAD = 1 / 3  # of the frames, half of which have learned depth; fewer see a floor or a table now and then
+_LEAST_ROAD = (
+    1 / 3
+)  # of the frames, half of which have learned depth; fewer see a floor or a table now and then
 _MAX_CONTRADICTION = 2.5  # largest factor between a measured length and that by learned depth
 _REFERENCE_FRAMES = 50  # number of first frames that mode reference compares
 _REJECTION_SIGMAS = 3.0  # distance from the median beyond which a frame is left out
@@ -56,7 +58,9 @@ _ACCELERATION_SIGMA = 3.0  # of a vehicle, in camera heights: 5 m/s2 at 1.65 m
 _SPEED_STEPS = 11  # window over which the speed is averaged that a change is compared with
 _LENGTH_SIGMA = 0.05  # of a single length where it is compared with the one before
 _CONTRADICTION_SIGMAS = 5.0
-_CORRELATED_WIDENING = 1.5  # factor on the sigmas in the pose graph, for errors correlated along the road
+_CORRELATED_WIDENING = (
+    1.5  # factor on the sigmas in the pose graph, for errors correlated along the road
+)
 
 
 @dataclass(frozen=True)
@@ -111,7 +115,10 @@ class Scale:
             return replace(self, estimate=other)
         per_frame = other.value * self.per_frame
         estimate = replace(other, value=float(np.median(per_frame)))
-        lengths = {ends: length._replace(value=other.value * length.value) for ends, length in self.lengths.items()}
+        lengths = {
+            ends: length._replace(value=other.value * length.value)
+            for ends, length in self.lengths.items()
+        }
         return replace(self, estimate=estimate, per_frame=per_frame, lengths=lengths, unit="metres")
 
     def scaled(self, measured: RelativePose) -> RelativePose:
@@ -120,7 +127,10 @@ class Scale:
 
 
 def find_scale(
-    mode: ScaleMode, camera_height_m: float | None, drive: Drive, lidar_steps: Sequence[RelativePose]
+    mode: ScaleMode,
+    camera_height_m: float | None,
+    drive: Drive,
+    lidar_steps: Sequence[RelativePose],
 ) -> Scale:
     """All lengths of a run in metres, or in camera heights where no mode gives metres (none, reference, known, gps).
 
@@ -132,13 +142,22 @@ def find_scale(
     if mode == "lidar":
         height = height_by_lidar(lidar_steps, drive) or camera_height_m
     unit = 1.0 if height is None else height
-    absolute = {ends: (unit * road.length_heights, road.relative_sigma) for ends, road in drive.road_steps.items()}
+    absolute = {
+        ends: (unit * road.length_heights, road.relative_sigma)
+        for ends, road in drive.road_steps.items()
+    }
     if mode == "lidar":
         sigmas = {pose.ends: float(pose.sigmas[3]) for pose in lidar_steps}
-        absolute |= {ends: (length, sigmas[ends] / length) for ends, length in metres.items() if length > 0}
+        absolute |= {
+            ends: (length, sigmas[ends] / length) for ends, length in metres.items() if length > 0
+        }
     by_planes = scale_from_road(drive.roads, unit)
     if isinstance(by_planes, Failed):
-        ratios = [absolute[ends][0] / motion.length_unscaled for ends, motion in motions.items() if ends in absolute]
+        ratios = [
+            absolute[ends][0] / motion.length_unscaled
+            for ends, motion in motions.items()
+            if ends in absolute
+        ]
         prior_unit = np.full(frames, float(np.median(ratios)) if ratios else 1.0)
     elif absolute:
         # steps of known length measure the drift of the unit; rain or a car ahead biases the learned ground plane
@@ -149,7 +168,9 @@ def find_scale(
     evidence = gather_evidence(steps, motions, absolute, prior_unit, unit)
     if not isinstance(by_planes, Failed):
         # a car ahead taken for the road for seconds would outweigh all other measurements
-        evidence.absolute[np.abs(evidence.absolute - evidence.learned) > np.log(_MAX_CONTRADICTION)] = np.nan
+        evidence.absolute[
+            np.abs(evidence.absolute - evidence.learned) > np.log(_MAX_CONTRADICTION)
+        ] = np.nan
     solved = solve_lengths(evidence)
     row_at = np.searchsorted([first for first, _ in steps], np.arange(frames), side="right") - 1
     per_frame = prior_unit * solved.unit_correction[row_at]
@@ -169,7 +190,9 @@ def find_scale(
     if named == "camera heights" and with_road < _LEAST_ROAD * frames:
         named = "no metric unit"
     contradicted = [ends for ends, is_so in zip(steps, solved.contradicted, strict=True) if is_so]
-    rows = zip(steps, solved.length, solved.relative_sigma, solved.relative_correlated_sigma, strict=True)
+    rows = zip(
+        steps, solved.length, solved.relative_sigma, solved.relative_correlated_sigma, strict=True
+    )
     lengths = {ends: StepLength(*map(float, row)) for ends, *row in rows if np.isfinite(row[0])}
     return Scale(mode, estimate, per_frame, lengths, named, contradicted)
 
@@ -192,7 +215,9 @@ def height_by_lidar(lidar_steps: Sequence[RelativePose], drive: Drive) -> float 
     return float(np.median(heights)) if heights else None
 
 
-def resolve_mode(config: ScaleConfig, camera_height_m: float | None, has_gps: bool = False) -> ScaleMode:
+def resolve_mode(
+    config: ScaleConfig, camera_height_m: float | None, has_gps: bool = False
+) -> ScaleMode:
     """The mode, with ``auto`` resolved: camera-height where the height is known, else gps where there is, else none."""
     if config.mode != "auto":
         return config.mode
@@ -244,7 +269,10 @@ def known_frames(config: ScaleConfig, stamps: FloatArray) -> tuple[int, int]:
             index, inside = end, end < len(stamps)
         else:
             stamp = float(end.removesuffix("s"))
-            index, inside = int(np.abs(stamps - stamp).argmin()), bool(stamps[0] <= stamp <= stamps[-1])
+            index, inside = (
+                int(np.abs(stamps - stamp).argmin()),
+                bool(stamps[0] <= stamp <= stamps[-1]),
+            )
         if not inside:
             raise SlamError(
                 f"scale.known_between names {end}, but the drive has frames 0 to {len(stamps) - 1} "
@@ -264,13 +292,17 @@ def scale_from_distance(
 ) -> ScaleEstimate | Failed:
     """The known distance of two frames over their estimated distance; raises as `known_frames`."""
     first, second = known_frames(config, stamps)
-    apart = np.linalg.norm(T_world_camera_unscaled[second, :3, 3] - T_world_camera_unscaled[first, :3, 3])
+    apart = np.linalg.norm(
+        T_world_camera_unscaled[second, :3, 3] - T_world_camera_unscaled[first, :3, 3]
+    )
     if config.known_m is None or not apart > 0:
         return Failed(f"the camera does not move between frames {first} and {second}")
     return ScaleEstimate(config.known_m / float(apart), 0.0, 2)
 
 
-def scale_track(roads: Sequence[float | Failed], height: float, estimate: ScaleEstimate) -> FloatArray:
+def scale_track(
+    roads: Sequence[float | Failed], height: float, estimate: ScaleEstimate
+) -> FloatArray:
     """The scale near each frame ``(N,)``: a running median over ground planes.
 
     The unit of learned depth drifts along a drive. Where the 41 frames around a frame hold too few
@@ -397,16 +429,26 @@ def solve_lengths(evidence: StepEvidence) -> StepLengths:
         state[:-1] = solveh_banded(information, right)
         residual = np.abs((state[plus] - state[minus] - value) / sigma)
         robust = 1.0 / (1.0 + (residual / OUTLIER_SIGMAS) ** 2)
-        weights = 1.0 / np.maximum(residual / _HUBER_K, 1.0) if iteration < _HUBER_ITERATIONS else robust
+        weights = (
+            1.0 / np.maximum(residual / _HUBER_K, 1.0) if iteration < _HUBER_ITERATIONS else robust
+        )
     log_length, log_unit = state[lengths], state[units]
     of_measured = np.where(measured[lengths], 1.0, np.nan)
     sigmas, correlations = marginals(information)
-    correlated_sigmas = _CORRELATED_WIDENING * sigmas * np.sqrt((1.0 + correlations) / (1.0 - correlations))
+    correlated_sigmas = (
+        _CORRELATED_WIDENING * sigmas * np.sqrt((1.0 + correlations) / (1.0 - correlations))
+    )
     sigmas, correlated_sigmas = of_measured * sigmas, of_measured * correlated_sigmas
     by_learned = (evidence.learned + log_unit - log_length) / _LEARNED_SIGMA
-    by_speed = (np.diff(log_length, prepend=np.nan) - evidence.steady) / (evidence.steady_sigma + _LENGTH_SIGMA)
-    contradicted = (np.abs(by_learned) > _CONTRADICTION_SIGMAS) | (np.abs(by_speed) > _CONTRADICTION_SIGMAS)
-    return StepLengths(of_measured * np.exp(log_length), sigmas, correlated_sigmas, np.exp(log_unit), contradicted)
+    by_speed = (np.diff(log_length, prepend=np.nan) - evidence.steady) / (
+        evidence.steady_sigma + _LENGTH_SIGMA
+    )
+    contradicted = (np.abs(by_learned) > _CONTRADICTION_SIGMAS) | (
+        np.abs(by_speed) > _CONTRADICTION_SIGMAS
+    )
+    return StepLengths(
+        of_measured * np.exp(log_length), sigmas, correlated_sigmas, np.exp(log_unit), contradicted
+    )
 
 
 def marginals(information: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -422,15 +464,22 @@ def marginals(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     neighbour, within, main = (band.reshape(-1, 2) for band in information)
     own = np.stack([main[:, 0], within[:, 1], within[:, 1], main[:, 1]], axis=1)
-    before, after = _from_before(own, neighbour[1:]), _from_before(own[::-1], neighbour[:0:-1])[::-1]
+    before, after = (
+        _from_before(own, neighbour[1:]),
+        _from_before(own[::-1], neighbour[:0:-1])[::-1],
+    )
     sigmas = np.sqrt(np.linalg.inv((before + after - own).reshape(-1, 2, 2))[:, 0, 0])
     coupling = np.zeros((len(own) - 1, 2, 2))  # of a step and the next
     coupling[:, 0, 0], coupling[:, 1, 1] = neighbour[1:].T
     earlier, later = before[:-1].reshape(-1, 2, 2), after[1:].reshape(-1, 2, 2)
     pairs = np.block([[earlier, coupling], [coupling, later]])  # (S - 1, 4, 4)
-    coupled = np.clip(np.linalg.inv(pairs)[:, 0, 2] / (sigmas[:-1] * sigmas[1:]), 0.0, _MOST_CORRELATED)
+    coupled = np.clip(
+        np.linalg.inv(pairs)[:, 0, 2] / (sigmas[:-1] * sigmas[1:]), 0.0, _MOST_CORRELATED
+    )
     ends = coupled[:1], coupled[-1:]
-    return np.asarray(sigmas), 0.5 * (np.concatenate([ends[0], coupled]) + np.concatenate([coupled, ends[1]]))
+    return np.asarray(sigmas), 0.5 * (
+        np.concatenate([ends[0], coupled]) + np.concatenate([coupled, ends[1]])
+    )
 
 
 def _from_before(own: FloatArray, coupling: FloatArray) -> FloatArray:
@@ -443,12 +492,23 @@ def _from_before(own: FloatArray, coupling: FloatArray) -> FloatArray:
         a_before, b_before, _, d_before = chain[-1]
         determinant = a_before * d_before - b_before**2
         b += of_length * of_unit * b_before / determinant
-        chain.append([a - of_length**2 * d_before / determinant, b, b, d - of_unit**2 * a_before / determinant])
+        chain.append(
+            [
+                a - of_length**2 * d_before / determinant,
+                b,
+                b,
+                d - of_unit**2 * a_before / determinant,
+            ]
+        )
     return np.array(chain)
 
 
 def _normal_equations(
-    plus: NDArray[np.intp], minus: NDArray[np.intp], value: FloatArray, weights: FloatArray, idle: FloatArray
+    plus: NDArray[np.intp],
+    minus: NDArray[np.intp],
+    value: FloatArray,
+    weights: FloatArray,
+    idle: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """The upper band ``(3, N)`` of the weighted normal matrix with ``idle`` on its diagonal, and the right side.
 

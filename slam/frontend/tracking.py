@@ -61,15 +61,21 @@ class Texture(NamedTuple):
 
 STEP_SEARCH = Search(side=11, levels=4, limits=(30, 0.01), back=None, error_px=0.5, norm=np.inf)
 # OpenCV computes eight columns of a window at once and those that remain one by one: 16 take half the time of 15
-KEYFRAME_SEARCH = Search(side=16, levels=3, limits=(15, 0.02), back=(1, (10, 0.05)), error_px=0.7, norm=2)
+KEYFRAME_SEARCH = Search(
+    side=16, levels=3, limits=(15, 0.02), back=(1, (10, 0.05)), error_px=0.7, norm=2
+)
 MAX_CORNERS = 800  # of a step: twice as many change no error and take twice the time
 STEP_CORNERS = Texture(quality=0.008, spacing_px=11.0, block_px=5)
 KEYFRAME_CORNERS = Texture(quality=0.0003, spacing_px=12.0, block_px=3)
 # displacements that remain after the predicted flow are small
 _PREDICTED_LEVELS = 2
 _ACROSS_PX = 1.0  # largest error of a corner over several steps, by the way across and step by step
-ROTATION_BASELINE = 2  # steps between frames whose rotation is also measured directly: halves its error
-FEW_CORNERS = 60  # tracks below which they are sought again, with the wide window and equal exposure
+ROTATION_BASELINE = (
+    2  # steps between frames whose rotation is also measured directly: halves its error
+)
+FEW_CORNERS = (
+    60  # tracks below which they are sought again, with the wide window and equal exposure
+)
 _WIDE_WINDOW_PX = 31  # side of the window after most tracks were lost, pixels
 
 
@@ -86,7 +92,9 @@ def track(
         guesses: where the search begins ``(M, 2)``; None is at the pixels themselves.
     """
     guesses = pixels if guesses is None else guesses
-    moved, forward = _lucas_kanade(first, second, pixels, guesses, search.side, search.levels, search.limits)
+    moved, forward = _lucas_kanade(
+        first, second, pixels, guesses, search.side, search.levels, search.limits
+    )
     levels, limits = search.back or (search.levels, search.limits)
     start = moved if search.back is None else pixels
     returned, backward = _lucas_kanade(second, first, moved, start, search.side, levels, limits)
@@ -95,7 +103,13 @@ def track(
 
 
 def _lucas_kanade(
-    first: Grey, second: Grey, pixels: Pixels, guesses: Pixels, side: int, levels: int, limits: tuple[int, float]
+    first: Grey,
+    second: Grey,
+    pixels: Pixels,
+    guesses: Pixels,
+    side: int,
+    levels: int,
+    limits: tuple[int, float],
 ) -> tuple[Pixels, NDArray[np.bool_]]:
     if not len(pixels):
         return pixels, np.zeros(0, np.bool_)
@@ -115,11 +129,17 @@ def _lucas_kanade(
 
 def are_inside(pixels: Pixels, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Which pixels ``(M, 2)`` lie in an image ``(H, W)``."""
-    return np.asarray((pixels >= 0).all(axis=1) & (pixels <= [shape[1] - 1, shape[0] - 1]).all(axis=1))
+    return np.asarray(
+        (pixels >= 0).all(axis=1) & (pixels <= [shape[1] - 1, shape[0] - 1]).all(axis=1)
+    )
 
 
 def new_corners(
-    grey: Grey, taken: Pixels, count: int, texture: Texture = KEYFRAME_CORNERS, hidden: Mask | None = None
+    grey: Grey,
+    taken: Pixels,
+    count: int,
+    texture: Texture = KEYFRAME_CORNERS,
+    hidden: Mask | None = None,
 ) -> Pixels:
     """Up to ``count`` Shi-Tomasi corners ``(M, 2)``, apart from each other and from those taken.
 
@@ -141,12 +161,22 @@ def new_corners(
     tiles, ranks = [np.zeros((0, 2), np.float32)], [np.zeros(0, np.int64)]
     for top, bottom in pairwise(np.linspace(0, grey.shape[0], _TILES[0] + 1).astype(int)):
         for left, right in pairwise(np.linspace(0, grey.shape[1], _TILES[1] + 1).astype(int)):
-            tile, mask = grey[top:bottom, left:right], np.ascontiguousarray(free[top:bottom, left:right])
+            tile, mask = (
+                grey[top:bottom, left:right],
+                np.ascontiguousarray(free[top:bottom, left:right]),
+            )
             corners = cv2.goodFeaturesToTrack(
-                tile, count, texture.quality, texture.spacing_px, mask=mask, blockSize=texture.block_px
+                tile,
+                count,
+                texture.quality,
+                texture.spacing_px,
+                mask=mask,
+                blockSize=texture.block_px,
             )
             if corners is not None:
-                before = np.count_nonzero(((taken >= (left, top)) & (taken < (right, bottom))).all(axis=1))
+                before = np.count_nonzero(
+                    ((taken >= (left, top)) & (taken < (right, bottom))).all(axis=1)
+                )
                 tiles.append(corners.reshape(-1, 2) + np.array([left, top], np.float32))
                 ranks.append(before + np.arange(len(corners)))
     order = np.argsort(np.concatenate(ranks), kind="stable")[:count]
@@ -189,7 +219,11 @@ class CornerTracker:
         self._next_track_id = 0
 
     def track(
-        self, previous: Frame, current: Frame, predicted_flow: PredictedFlow | None = None, standing: Mask | None = None
+        self,
+        previous: Frame,
+        current: Frame,
+        predicted_flow: PredictedFlow | None = None,
+        standing: Mask | None = None,
     ) -> Tracks:
         """Corners of ``previous`` tracked to ``current``.
 
@@ -206,14 +240,21 @@ class CornerTracker:
         before, now = pixels[kept].astype(np.float64), forward[kept].astype(np.float64)
         return Tracks(before, now, track_ids[kept], len(kept))
 
-    def track_across(self, previous: Frame, current: Frame, predicted_flow: PredictedFlow) -> Callable[[], Tracks]:
+    def track_across(
+        self, previous: Frame, current: Frame, predicted_flow: PredictedFlow
+    ) -> Callable[[], Tracks]:
         """Prepare to track corners of ``previous`` to a frame some steps later, to which they came step by step.
 
         The function returned does it, in any thread. It keeps corners that both ways find at the same place, which is
         half the work of tracking them back.
         """
-        nothing: tuple[Pixels, NDArray[np.int64]] = np.zeros((0, 2), np.float32), np.zeros(0, np.int64)
-        corners, arrived = (self._corners.get(frame.index, nothing) for frame in (previous, current))
+        nothing: tuple[Pixels, NDArray[np.int64]] = (
+            np.zeros((0, 2), np.float32),
+            np.zeros(0, np.int64),
+        )
+        corners, arrived = (
+            self._corners.get(frame.index, nothing) for frame in (previous, current)
+        )
         track_ids, rows, rows_arrived = np.intersect1d(corners[1], arrived[1], return_indices=True)
         points, by_steps = corners[0][rows], arrived[0][rows_arrived]
 
@@ -229,11 +270,16 @@ class CornerTracker:
 
         return find
 
-    def _fill(self, frame: Frame, pixels: Pixels, track_ids: NDArray[np.int64], standing: Mask | None) -> None:
+    def _fill(
+        self, frame: Frame, pixels: Pixels, track_ids: NDArray[np.int64], standing: Mask | None
+    ) -> None:
         """Keep the corners tracked to a frame, and new ones up to the largest number."""
         fresh = new_corners(frame.grey, pixels, MAX_CORNERS - len(pixels), STEP_CORNERS, standing)
         new_ids = self._next_track_id + np.arange(len(fresh))
-        self._corners[frame.index] = np.concatenate([pixels, fresh]), np.concatenate([track_ids, new_ids])
+        self._corners[frame.index] = (
+            np.concatenate([pixels, fresh]),
+            np.concatenate([track_ids, new_ids]),
+        )
         self._next_track_id += len(fresh)
         for index in sorted(self._corners)[: -ROTATION_BASELINE - 2]:
             del self._corners[index]
@@ -248,7 +294,8 @@ def _tracked(
     if kept.sum() < FEW_CORNERS:
         # the second image with its histogram matched to that of the first
         ranks_first, ranks = (
-            np.cumsum(np.bincount(image.ravel(), minlength=256)) / image.size for image in (first, second)
+            np.cumsum(np.bincount(image.ravel(), minlength=256)) / image.size
+            for image in (first, second)
         )
         levels = np.interp(ranks, ranks_first, np.arange(256.0))
         exposed = np.asarray(cv2.LUT(second, np.rint(levels).astype(np.uint8)))
@@ -259,7 +306,11 @@ def _tracked(
 
 
 def _by_first_flow(
-    first: Grey, second: Grey, points: Pixels, flows: Sequence[PredictedFlow | None], side: int = STEP_SEARCH.side
+    first: Grey,
+    second: Grey,
+    points: Pixels,
+    flows: Sequence[PredictedFlow | None],
+    side: int = STEP_SEARCH.side,
 ) -> tuple[Pixels, NDArray[np.bool_]]:
     """Points ``(M, 2)`` by the first predicted flow, or by none, with which they are found back; which are ``(M,)``."""
     pixels, kept = points.copy(), np.zeros(len(points), dtype=bool)
@@ -267,9 +318,14 @@ def _by_first_flow(
         tried = np.flatnonzero(~kept)
         levels = STEP_SEARCH.levels if flow is None else _PREDICTED_LEVELS
         image = second if flow is None else flow.warp_back(second)
-        moved, found_back = track(first, image, points[tried], STEP_SEARCH._replace(side=side, levels=levels))
+        moved, found_back = track(
+            first, image, points[tried], STEP_SEARCH._replace(side=side, levels=levels)
+        )
         moved = moved[found_back]
-        pixels[tried[found_back]], kept[tried[found_back]] = moved if flow is None else flow.in_current(moved), True
+        pixels[tried[found_back]], kept[tried[found_back]] = (
+            moved if flow is None else flow.in_current(moved),
+            True,
+        )
     return pixels, kept & are_inside(pixels, second.shape)
 
 
@@ -286,14 +342,20 @@ class PredictedFlow:
     intrinsics: Intrinsics
 
     @classmethod
-    def of(cls, T_previous_current: FloatArray, depth_previous: DepthMap, intrinsics: Intrinsics) -> Self | None:
+    def of(
+        cls, T_previous_current: FloatArray, depth_previous: DepthMap, intrinsics: Intrinsics
+    ) -> Self | None:
         """By a pose in the unit of the depth; None where it has no length."""
         known = UnitRelativePose.of(invert(T_previous_current))
         return None if known is None else cls(*known, depth_previous, intrinsics)
 
     def warp_back(self, current: Grey) -> Grey:
         """The later image ``(H, W)`` warped to the earlier one, equal to it where the prediction is right."""
-        return np.asarray(cv2.remap(current, self._current, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+        return np.asarray(
+            cv2.remap(
+                current, self._current, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+            )
+        )
 
     def in_current(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
         """Where pixels ``(M, 2)`` of the warped image lie in the later one."""
@@ -313,17 +375,25 @@ class PredictedFlow:
         if ratio > 1:
             size = width // ratio, max(height // ratio, 1)
             depth = cv2.resize(self.depth_previous, size, interpolation=cv2.INTER_NEAREST_EXACT)
-            small = PredictedFlow(self.unit_pose, self.length, np.asarray(depth), self.intrinsics.resized(*size))
+            small = PredictedFlow(
+                self.unit_pose, self.length, np.asarray(depth), self.intrinsics.resized(*size)
+            )
             later = small.depth_current()
-            return np.asarray(cv2.resize(later, (width, height), interpolation=cv2.INTER_NEAREST_EXACT))
+            return np.asarray(
+                cv2.resize(later, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+            )
         grid = _pixels(self.intrinsics)
         flow = self._current - grid
         before = grid - flow
         for _ in range(_INVERSIONS - 1):  # fixed point: a pixel less the flow that ends there
-            before = grid - cv2.remap(flow, before, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            before = grid - cv2.remap(
+                flow, before, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            )
         turned, moved = self._projection
         x, y = before[..., 0], before[..., 1]
-        depth = cv2.remap(self.depth_previous, before, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+        depth = cv2.remap(
+            self.depth_previous, before, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
+        )
         later = depth * (turned[2, 0] * x + turned[2, 1] * y + turned[2, 2]) + moved[2]
         return np.where((depth > 0) & (later > 0), later, np.float32(np.nan))
 
@@ -332,7 +402,9 @@ class PredictedFlow:
         """``K R K^-1`` ``(3, 3)`` and ``K t`` ``(3,)``."""
         K = self.intrinsics.K
         turned = K @ self.unit_pose.R_current_previous @ np.linalg.inv(K)
-        return turned.astype(np.float32), (self.length * K @ self.unit_pose.direction).astype(np.float32)
+        return turned.astype(np.float32), (self.length * K @ self.unit_pose.direction).astype(
+            np.float32
+        )
 
     @cached_property
     def _current(self) -> NDArray[np.float32]:
@@ -340,7 +412,9 @@ class PredictedFlow:
         height, width = self.depth_previous.shape
         turned, moved = self._projection
         rows, columns = max(height // _GRID_PX, 1), max(width // _GRID_PX, 1)
-        depth = cv2.resize(self.depth_previous, (columns, rows), interpolation=cv2.INTER_NEAREST_EXACT)
+        depth = cv2.resize(
+            self.depth_previous, (columns, rows), interpolation=cv2.INTER_NEAREST_EXACT
+        )
         v = ((np.arange(rows) + 0.5) * height / rows - 0.5).astype(np.float32)
         u = ((np.arange(columns) + 0.5) * width / columns - 0.5).astype(np.float32)
         near = cv2.divide(1.0, depth)

@@ -63,7 +63,12 @@ def ransac_order(count: int, seed: int) -> NDArray[np.intp]:
 
 
 def consensus(
-    points: FloatArray, pixels: FloatArray, K: FloatArray, iterations: int, reprojection_px: float, seed: int = 0
+    points: FloatArray,
+    pixels: FloatArray,
+    K: FloatArray,
+    iterations: int,
+    reprojection_px: float,
+    seed: int = 0,
 ) -> tuple[FloatArray, NDArray[np.intp]]:
     """``T_camera_world`` and rows of the inliers with most support; the identity and none where no pose has any.
 
@@ -79,7 +84,11 @@ def consensus(
     """
     order = ransac_order(len(points), seed)
     params = cv2.UsacParams()
-    params.maxIterations, params.threshold, params.confidence = iterations, reprojection_px, _CONFIDENCE
+    params.maxIterations, params.threshold, params.confidence = (
+        iterations,
+        reprojection_px,
+        _CONFIDENCE,
+    )
     params.sampler, params.score = cv2.SAMPLING_UNIFORM, cv2.SCORE_METHOD_MSAC
     params.loMethod = cv2.LOCAL_OPTIM_NULL
     is_solved, _, rotation, translation, chosen = cv2.solvePnPRansac(
@@ -117,7 +126,11 @@ def resect(
     best = _best(guesses, points, pixels, K, seed, spread, everything)
     if trusted is not None and _support(best, trusted) < _DOUBTFUL_RATIO * trusted.sum():
         by_trusted = _best(guesses, points, pixels, K, seed, spread, trusted)
-        best = by_trusted if _support(by_trusted, trusted) > _CLEARLY * _support(best, trusted) else best
+        best = (
+            by_trusted
+            if _support(by_trusted, trusted) > _CLEARLY * _support(best, trusted)
+            else best
+        )
     return best
 
 
@@ -185,7 +198,11 @@ def _refined(
 
 
 def _whitened(
-    T_camera_world: FloatArray, points: FloatArray, spread: FloatArray | None, rays: FloatArray, focal: FloatArray
+    T_camera_world: FloatArray,
+    points: FloatArray,
+    spread: FloatArray | None,
+    rays: FloatArray,
+    focal: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Residuals of pixels ``(2, M)``, their derivatives ``(6, 2, M)``, and the points in the camera ``(M, 3)``.
 
@@ -199,7 +216,9 @@ def _whitened(
     line = (J[3:] * (spread @ T_camera_world[:3, :3].T).T[:, None]).sum(axis=0)
     square = np.maximum((line**2).sum(axis=0), 1e-9)
     taken = (1.0 - PIXEL_SIGMA / np.sqrt(PIXEL_SIGMA**2 + square)) / square
-    residual, J = (of - (taken * (of * line).sum(axis=-2))[..., None, :] * line for of in (residual, J))
+    residual, J = (
+        of - (taken * (of * line).sum(axis=-2))[..., None, :] * line for of in (residual, J)
+    )
     return residual, J, X
 
 
@@ -225,7 +244,11 @@ class UnitRelativePose:
     def of(cls, T_current_previous: FloatArray) -> tuple[Self, float] | None:
         """That of a transform, and its length; None where it has none."""
         length = float(np.linalg.norm(T_current_previous[:3, 3]))
-        return (cls(T_current_previous[:3, :3], T_current_previous[:3, 3] / length), length) if length > 0 else None
+        return (
+            (cls(T_current_previous[:3, :3], T_current_previous[:3, 3] / length), length)
+            if length > 0
+            else None
+        )
 
 
 def unit_pose_by_essential(
@@ -250,7 +273,9 @@ def unit_pose_by_essential(
     rays_previous, rays_current = rays_previous[inliers], rays_current[inliers]
     R, R_twisted, direction = cv2.decomposeEssentialMat(E)
     unit_poses = [
-        UnitRelativePose(rotated, sign * direction.ravel()) for rotated in (R, R_twisted) for sign in (1.0, -1.0)
+        UnitRelativePose(rotated, sign * direction.ravel())
+        for rotated in (R, R_twisted)
+        for sign in (1.0, -1.0)
     ]
 
     def in_front_of_both(unit_pose: UnitRelativePose) -> int:
@@ -271,7 +296,11 @@ def unit_poses_by_homography(
     rays_previous, rays_current = rays_previous[order], rays_current[order]
     cv2.setRNGSeed(seed)
     H, mask = cv2.findHomography(
-        rays_previous[:, :2].copy(), rays_current[:, :2].copy(), cv2.USAC_MAGSAC, tolerance, maxIters=1000
+        rays_previous[:, :2].copy(),
+        rays_current[:, :2].copy(),
+        cv2.USAC_MAGSAC,
+        tolerance,
+        maxIters=1000,
     )
     if H is None or int(mask.sum()) < _LEAST_CONSENSUS:
         return []
@@ -285,7 +314,11 @@ def unit_poses_by_homography(
 
 
 def unit_pose_by_pnp(
-    rays_previous: FloatArray, rays_current: FloatArray, depth_previous: FloatArray, tolerance: float, seed: int = 0
+    rays_previous: FloatArray,
+    rays_current: FloatArray,
+    depth_previous: FloatArray,
+    tolerance: float,
+    seed: int = 0,
 ) -> UnitRelativePose | None:
     """The motion with most support among the same rays where their depths ``(M,)`` are known, else NaN.
 
@@ -295,13 +328,18 @@ def unit_pose_by_pnp(
     if known.sum() < _LEAST_CONSENSUS:
         return None
     points = rays_previous[known] * depth_previous[known, None]
-    T_current_previous, _ = consensus(points, rays_current[known, :2].copy(), np.eye(3), _RESECTIONS, tolerance, seed)
+    T_current_previous, _ = consensus(
+        points, rays_current[known, :2].copy(), np.eye(3), _RESECTIONS, tolerance, seed
+    )
     found = UnitRelativePose.of(T_current_previous)
     return found[0] if found else None
 
 
 def parallax_px(
-    rays_previous: FloatArray, rays_current: FloatArray, R_current_previous: FloatArray, focal: tuple[float, float]
+    rays_previous: FloatArray,
+    rays_current: FloatArray,
+    R_current_previous: FloatArray,
+    focal: tuple[float, float],
 ) -> FloatArray:
     """Optical flow of each point in pixels ``(M,)`` without that of the rotation."""
     rotated = rays_previous @ R_current_previous.T
@@ -326,7 +364,9 @@ def rotation_between(rays_previous: FloatArray, rays_current: FloatArray) -> Flo
     return R_current_previous
 
 
-def triangulated_depth(rays_previous: FloatArray, rays_current: FloatArray, unit_pose: UnitRelativePose) -> FloatArray:
+def triangulated_depth(
+    rays_previous: FloatArray, rays_current: FloatArray, unit_pose: UnitRelativePose
+) -> FloatArray:
     """z-depth ``(M,)`` in the previous camera in units of the motion's length; negative behind the camera.
 
     From ``z R x + t = z' x'``: the cross product with x' leaves ``z (x' x R x) = -(x' x t)``.
@@ -353,12 +393,18 @@ def _across_and_along(
 ) -> tuple[FloatArray, FloatArray]:
     """The two sides ``(3, M)`` of ``z (x' x R x) = -(x' x t)``."""
     current = rays_current.T
-    return cross(current, unit_pose.R_current_previous @ rays_previous.T), -cross(current, unit_pose.direction)
+    return cross(current, unit_pose.R_current_previous @ rays_previous.T), -cross(
+        current, unit_pose.direction
+    )
 
 
-def depth_in_current(rays_previous: FloatArray, depth_previous: FloatArray, unit_pose: UnitRelativePose) -> FloatArray:
+def depth_in_current(
+    rays_previous: FloatArray, depth_previous: FloatArray, unit_pose: UnitRelativePose
+) -> FloatArray:
     """z-depth ``(M,)`` in the current camera of points at ``depth_previous`` ``(M,)``, both in the motion's length."""
-    return np.asarray(depth_previous * (rays_previous @ unit_pose.R_current_previous[2]) + unit_pose.direction[2])
+    return np.asarray(
+        depth_previous * (rays_previous @ unit_pose.R_current_previous[2]) + unit_pose.direction[2]
+    )
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:

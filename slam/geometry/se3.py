@@ -42,7 +42,10 @@ def rotation_angle(R: FloatArray) -> FloatArray:
 
     The sine comes from the skew part and the cosine from the trace, so neither end loses digits.
     """
-    skew = np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1)
+    skew = np.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]],
+        axis=-1,
+    )
     sine = np.linalg.norm(skew, axis=-1)
     cosine = np.trace(R, axis1=-2, axis2=-1) - 1.0
     angle: FloatArray = np.arctan2(sine, cosine)
@@ -103,7 +106,9 @@ def rotation_matrix(rotation_vector: FloatArray) -> FloatArray:
 
 def from_rotation_vector(rotation_vector: FloatArray, t_a_b: FloatArray) -> FloatArray:
     """``T_a_b`` from axis times angle in radians ``(..., 3)`` and translation ``(..., 3)``."""
-    return make(Rotation.from_rotvec(rotation_vector).as_matrix(), np.asarray(t_a_b, dtype=np.float64))
+    return make(
+        Rotation.from_rotvec(rotation_vector).as_matrix(), np.asarray(t_a_b, dtype=np.float64)
+    )
 
 
 def tangent(T_a_b: FloatArray) -> FloatArray:

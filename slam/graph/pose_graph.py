@@ -31,8 +31,12 @@ from slam.runtime.errors import SlamError
 from slam.runtime.files import write_atomically
 
 _ANCHOR_SIGMA = 1e-6
-_LOOSE_SIGMAS = np.repeat([0.3, 1e3], 3)  # of the first pose where positions hold the graph: radians, metres
-HUBER_K = 1.345  # whitened residual at which the loss becomes linear: 95 % efficient for normal errors
+_LOOSE_SIGMAS = np.repeat(
+    [0.3, 1e3], 3
+)  # of the first pose where positions hold the graph: radians, metres
+HUBER_K = (
+    1.345  # whitened residual at which the loss becomes linear: 95 % efficient for normal errors
+)
 # of a loop or position that is removed: whitened residual, and over the median of its kind
 _LARGEST_RESIDUAL, _OUTLYING = 8.0, 3.0
 _MAX_ITERATIONS = 100  # of Levenberg-Marquardt
@@ -80,7 +84,11 @@ class PoseGraph:
         self.relative_poses += relative_poses
 
     def add_positions(
-        self, frames: NDArray[np.intp], positions: FloatArray, sigmas: FloatArray, T_fixed_world_initial: FloatArray
+        self,
+        frames: NDArray[np.intp],
+        positions: FloatArray,
+        sigmas: FloatArray,
+        T_fixed_world_initial: FloatArray,
     ) -> None:
         """Add positions ``(M, 3)`` at ``frames`` ``(M,)``, metres, with ``sigmas`` ``(M, 3)`` along their axes.
 
@@ -103,21 +111,27 @@ class PoseGraph:
         """
         _check_connected(self.relative_poses, len(T_world_camera_initial))
         if not is_se3(T_world_camera_initial):
-            raise SlamError("the initial trajectory of the pose graph must be finite rigid transforms")
+            raise SlamError(
+                "the initial trajectory of the pose graph must be finite rigid transforms"
+            )
         for _ in range(_MAX_DROPPED_LOOPS + 1):
             try:
                 self._T_world_camera = self._solve(T_world_camera_initial)
                 return self._T_world_camera.copy()
             except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException among them
                 reason = str(error).strip().partition("\n")[0]
-                loops = [k for k, edge in enumerate(self.relative_poses) if edge.source == LOOP_SOURCE]
+                loops = [
+                    k for k, edge in enumerate(self.relative_poses) if edge.source == LOOP_SOURCE
+                ]
                 if not loops:
                     raise SlamError(f"the pose graph cannot be solved: {reason}") from error
                 newest = self.relative_poses.pop(loops[-1])
                 self.dropped.append(newest)
                 logger.warning("loop %d -> %d dropped from the graph: %s", *newest.ends, reason)
                 _check_connected(self.relative_poses, len(T_world_camera_initial))
-        raise SlamError(f"the pose graph cannot be solved even without {len(self.dropped)} loop edges")
+        raise SlamError(
+            f"the pose graph cannot be solved even without {len(self.dropped)} loop edges"
+        )
 
     def drop_contradicted(self) -> bool:
         """Drop loops and positions with a large residual at the optimised trajectory while most have a small one.
@@ -129,16 +143,25 @@ class PoseGraph:
             Whether one was dropped: optimise again.
         """
         T_world_camera = self._solution()
-        is_wrong = np.array([edge.source == LOOP_SOURCE for edge in self.relative_poses], dtype=bool)
-        is_wrong[is_wrong] = _outlying(whitened_squared(compress(self.relative_poses, is_wrong), T_world_camera))
+        is_wrong = np.array(
+            [edge.source == LOOP_SOURCE for edge in self.relative_poses], dtype=bool
+        )
+        is_wrong[is_wrong] = _outlying(
+            whitened_squared(compress(self.relative_poses, is_wrong), T_world_camera)
+        )
         self.dropped += compress(self.relative_poses, is_wrong)
         self.relative_poses = list(compress(self.relative_poses, ~is_wrong))
         placed = (self.T_fixed_world @ T_world_camera)[:, :3, 3]
-        squared = [float((((placed[k] - position) / own) ** 2).sum()) for k, position, own in self._positions]
+        squared = [
+            float((((placed[k] - position) / own) ** 2).sum())
+            for k, position, own in self._positions
+        ]
         is_stray = _outlying(np.array(squared))
         self._positions = list(compress(self._positions, ~is_stray))
         if is_stray.any():
-            logger.warning("%d of %d positions contradict the others: left out", is_stray.sum(), len(is_stray))
+            logger.warning(
+                "%d of %d positions contradict the others: left out", is_stray.sum(), len(is_stray)
+            )
         return bool(is_wrong.any() or is_stray.any())
 
     def marginal(self, frame: int) -> FloatArray:
@@ -152,7 +175,9 @@ class PoseGraph:
         """
         T_world_camera = self._solution()
         if not 0 <= frame < len(T_world_camera):
-            raise SlamError(f"no frame {frame} in the pose graph: it has 0 to {len(T_world_camera) - 1}")
+            raise SlamError(
+                f"no frame {frame} in the pose graph: it has 0 to {len(T_world_camera) - 1}"
+            )
         values = self._values(T_world_camera)
         return np.asarray(gtsam.Marginals(self._factors(values), values).marginalCovariance(frame))
 
@@ -160,11 +185,16 @@ class PoseGraph:
         """Write the optimised graph in g2o's text format at full precision, atomically."""
         T_from_to = np.array([edge.T_from_to for edge in self.relative_poses]).reshape(-1, 4, 4)
         lines = [
-            f"{_VERTEX} {k} {_numbers(pose)}" for k, pose in enumerate(translations_and_quaternions(self._solution()))
+            f"{_VERTEX} {k} {_numbers(pose)}"
+            for k, pose in enumerate(translations_and_quaternions(self._solution()))
         ]
-        for edge, pose in zip(self.relative_poses, translations_and_quaternions(T_from_to), strict=True):
+        for edge, pose in zip(
+            self.relative_poses, translations_and_quaternions(T_from_to), strict=True
+        ):
             information = np.diag(1.0 / edge.graph_sigmas[_TRANSLATION_FIRST] ** 2)[_UPPER]
-            lines.append(f"{_EDGE} {edge.from_index} {edge.to_index} {_numbers(pose)} {_numbers(information)}")
+            lines.append(
+                f"{_EDGE} {edge.from_index} {edge.to_index} {_numbers(pose)} {_numbers(information)}"
+            )
         write_atomically(path, "\n".join([*lines, ""]))
 
     def _solution(self) -> FloatArray:
@@ -181,8 +211,15 @@ class PoseGraph:
         solved = optimiser.optimize()
         errors = graph.error(values), optimiser.error()
         count, iterations = len(self.relative_poses), optimiser.iterations()
-        logger.info("pose graph: %d factors, error %.4g to %.4g in %d iterations", count, *errors, iterations)
-        T_fixed_camera = np.stack([solved.atPose3(k).matrix() for k in range(len(T_world_camera_initial))])
+        logger.info(
+            "pose graph: %d factors, error %.4g to %.4g in %d iterations",
+            count,
+            *errors,
+            iterations,
+        )
+        T_fixed_camera = np.stack(
+            [solved.atPose3(k).matrix() for k in range(len(T_world_camera_initial))]
+        )
         if not np.isfinite(T_fixed_camera).all():
             raise RuntimeError("the solution is not finite")
         T_fixed_camera[:, :3, :3] = Rotation.from_matrix(T_fixed_camera[:, :3, :3]).as_matrix()
@@ -201,16 +238,24 @@ class PoseGraph:
     def _factors(self, values: Any) -> Any:
         graph = gtsam.NonlinearFactorGraph()
         sigmas = _LOOSE_SIGMAS if self._positions else np.full(6, _ANCHOR_SIGMA)
-        graph.add(gtsam.PriorFactorPose3(0, values.atPose3(0), gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+        graph.add(
+            gtsam.PriorFactorPose3(0, values.atPose3(0), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+        )
         for edge in self.relative_poses:
             noise = robust_noise(edge.graph_sigmas)
-            graph.add(gtsam.BetweenFactorPose3(edge.from_index, edge.to_index, _pose3(edge.T_from_to), noise))
+            graph.add(
+                gtsam.BetweenFactorPose3(
+                    edge.from_index, edge.to_index, _pose3(edge.T_from_to), noise
+                )
+            )
         for frame, position, own in self._positions:
             graph.add(gtsam.GPSFactor(frame, position, robust_noise(own)))
         return graph
 
 
-def whitened_squared(relative_poses: Iterable[RelativePose], T_world_camera: FloatArray) -> FloatArray:
+def whitened_squared(
+    relative_poses: Iterable[RelativePose], T_world_camera: FloatArray
+) -> FloatArray:
     """Whitened squared 6-dof residual ``(F,)`` of each measurement at a trajectory ``(N, 4, 4)``."""
     squared = []
     for edge in relative_poses:
@@ -234,7 +279,9 @@ def _check_connected(relative_poses: Sequence[RelativePose], count: int) -> None
     _, component = connected_components(links, directed=False)
     loose = np.flatnonzero(component != component[0])
     if len(loose):
-        raise SlamError(f"{len(loose)} of {count} frames are not connected to the first, from frame {loose[0]} on")
+        raise SlamError(
+            f"{len(loose)} of {count} frames are not connected to the first, from frame {loose[0]} on"
+        )
 
 
 def robust_noise(sigmas: FloatArray) -> Any:
@@ -292,7 +339,9 @@ def optimise_similarities(
     try:
         solved = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
     except RuntimeError as error:
-        raise SlamError(f"the maps cannot be joined: {str(error).strip().partition(chr(10))[0]}") from error
+        raise SlamError(
+            f"the maps cannot be joined: {str(error).strip().partition(chr(10))[0]}"
+        ) from error
     found = [solved.atSimilarity3(k) for k in range(len(T_world_camera))]
     R = Rotation.from_matrix([each.rotation().matrix() for each in found]).as_matrix()
     scales = np.array([each.scale() for each in found])

@@ -19,7 +19,14 @@ from erfsfm.common.processes import side_by_side
 from slam.config.sections import LoopsConfig
 from slam.frames import Intrinsics, RelativePose, View
 from slam.geometry.se3 import FloatArray, invert, path_distance, rotation_angle
-from slam.loops.recognition import OF_FRAMES, Loop, LoopThresholds, LoopVerifier, PlaceIndex, RejectedLoop
+from slam.loops.recognition import (
+    OF_FRAMES,
+    Loop,
+    LoopThresholds,
+    LoopVerifier,
+    PlaceIndex,
+    RejectedLoop,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -33,7 +40,9 @@ _SAME_PLACE = 0.05  # of the least path of a loop: 0.75 m
 _BLOCK = 256
 Apart = Callable[[NDArray[np.intp]], NDArray[np.bool_]]
 _SUPPORT_SIGMAS = 3.0  # largest difference of supporting loops, sigmas
-_SUPPORT_DRIFT_RATIO = 0.1  # drift of the odometry between supporting loops over the path between them
+_SUPPORT_DRIFT_RATIO = (
+    0.1  # drift of the odometry between supporting loops over the path between them
+)
 
 
 @dataclass(frozen=True)
@@ -52,7 +61,11 @@ class LoopClosures:
     def without(self, dropped: Sequence[RelativePose]) -> LoopClosures:
         """The same after the pose graph dropped some accepted loops."""
         ends = {(edge.from_index, edge.to_index) for edge in dropped}
-        gone = tuple(loop.refused("contradicts the pose graph") for loop in self.accepted if loop.ends in ends)
+        gone = tuple(
+            loop.refused("contradicts the pose graph")
+            for loop in self.accepted
+            if loop.ends in ends
+        )
         kept = tuple(loop for loop in self.accepted if loop.ends not in ends)
         return replace(self, accepted=kept, rejected=gone + self.rejected)
 
@@ -60,16 +73,32 @@ class LoopClosures:
         """For ``loops.json``: every accepted loop with its measurement, and the rejected ones with most inliers."""
 
         def entry(ends: tuple[int, int], loop: Loop | RejectedLoop, **more: Any) -> dict[str, Any]:
-            return {"from": ends[0], "to": ends[1], "inliers": loop.inliers, "score": round(loop.score, 4), **more}
+            return {
+                "from": ends[0],
+                "to": ends[1],
+                "inliers": loop.inliers,
+                "score": round(loop.score, 4),
+                **more,
+            }
 
         accepted = []
         for loop in self.accepted:
             reason, measured = f"{loop.inliers} inliers in both directions", loop.measured
-            measurement = {"T_from_to": measured.T_from_to.tolist(), "sigmas": measured.sigmas.tolist()}
+            measurement = {
+                "T_from_to": measured.T_from_to.tolist(),
+                "sigmas": measured.sigmas.tolist(),
+            }
             accepted.append(entry(loop.ends, loop, reason=reason, **measurement))
-        rejected = [entry((loop.from_index, loop.to_index), loop, reason=loop.reason) for loop in self.rejected]
+        rejected = [
+            entry((loop.from_index, loop.to_index), loop, reason=loop.reason)
+            for loop in self.rejected
+        ]
         more = max(len(rejected) - MOST_REJECTED, 0)
-        return {"accepted": accepted, "rejected": rejected[:MOST_REJECTED], "rejected_left_out": more}
+        return {
+            "accepted": accepted,
+            "rejected": rejected[:MOST_REJECTED],
+            "rejected_left_out": more,
+        }
 
 
 def close_loops(
@@ -95,10 +124,14 @@ def close_loops(
         return np.asarray(is_later & (track.path[frames][rows, None] - track.path[frames] >= least))
 
     closures = find_loops(views, track, apart, LoopVerifier(OF_FRAMES, intrinsics, seed))
-    return replace(closures, accepted=tuple(_counted_once(closures.accepted, track.path, _SAME_PLACE * least)))
+    return replace(
+        closures, accepted=tuple(_counted_once(closures.accepted, track.path, _SAME_PLACE * least))
+    )
 
 
-def find_loops(views: Sequence[View], track: Track, apart: Apart, verifier: LoopVerifier) -> LoopClosures:
+def find_loops(
+    views: Sequence[View], track: Track, apart: Apart, verifier: LoopVerifier
+) -> LoopClosures:
     """Loops among the views of a track that are verified and agree with each other.
 
     The views are in time order, of some rows of the track, their points in the units of their maps; ``apart`` says
@@ -106,22 +139,30 @@ def find_loops(views: Sequence[View], track: Track, apart: Apart, verifier: Loop
     """
 
     def verdicts(candidates: Iterable[Candidate]) -> list[Loop | RejectedLoop]:
-        return side_by_side(lambda c: verifier.verify(views[c.earlier], views[c.later], c.score), list(candidates))
+        return side_by_side(
+            lambda c: verifier.verify(views[c.earlier], views[c.later], c.score), list(candidates)
+        )
 
     candidates = find_candidates(views, apart, verifier.thresholds)
     tried = verdicts(c for c in candidates if c.rank < _TRIED_FIRST)
     seen_again = {verdict.ends[1] for verdict in tried if isinstance(verdict, Loop)}
-    tried += verdicts(c for c in candidates if c.rank >= _TRIED_FIRST and views[c.later].index in seen_again)
+    tried += verdicts(
+        c for c in candidates if c.rank >= _TRIED_FIRST and views[c.later].index in seen_again
+    )
     verified = [verdict for verdict in tried if isinstance(verdict, Loop)]
     accepted, rejected = agreeing(verified, track, verifier.thresholds)
     rejected += [verdict for verdict in tried if isinstance(verdict, RejectedLoop)]
-    logger.info("loops: %d candidates, %d verified, %d accepted", len(tried), len(verified), len(accepted))
+    logger.info(
+        "loops: %d candidates, %d verified, %d accepted", len(tried), len(verified), len(accepted)
+    )
     return LoopClosures(len(tried), len(verified), tuple(accepted), most_inliers_first(rejected))
 
 
 def most_inliers_first(loops: Iterable[RejectedLoop]) -> tuple[RejectedLoop, ...]:
     """Rejected loops in the order in which they are reported."""
-    return tuple(sorted(loops, key=lambda loop: (-loop.inliers, -loop.score, loop.to_index, loop.from_index)))
+    return tuple(
+        sorted(loops, key=lambda loop: (-loop.inliers, -loop.score, loop.to_index, loop.from_index))
+    )
 
 
 def _least_path(views: Sequence[View], is_metric: bool) -> float:
@@ -145,7 +186,10 @@ def _counted_once(loops: Sequence[Loop], path: FloatArray, near: float) -> list[
     ends = path[np.array([loop.ends for loop in loops], int).reshape(-1, 2)]
     alike = (np.abs(ends[:, None] - ends) < near).all(axis=2).sum(axis=1)
     return [
-        replace(loop, measured=replace(loop.measured, sigmas=float(np.sqrt(count)) * loop.measured.sigmas))
+        replace(
+            loop,
+            measured=replace(loop.measured, sigmas=float(np.sqrt(count)) * loop.measured.sigmas),
+        )
         for loop, count in zip(loops, alike, strict=True)
     ]
 
@@ -162,7 +206,9 @@ class Candidate(NamedTuple):
     rank: int
 
 
-def find_candidates(views: Sequence[View], apart: Apart, thresholds: LoopThresholds) -> list[Candidate]:
+def find_candidates(
+    views: Sequence[View], apart: Apart, thresholds: LoopThresholds
+) -> list[Candidate]:
     """For each view, in time order, the most similar earlier views, the best first.
 
     ``apart`` says of some views ``(B,)``, by their rows, and of all views whether they may make a loop ``(B, V)``.
@@ -219,10 +265,14 @@ class Track:
 
     def rows(self, loops: Sequence[Loop]) -> NDArray[np.intp]:
         """Rows of both ends of loops ``(L, 2)``."""
-        return np.searchsorted(self.frames, np.array([loop.ends for loop in loops], np.intp).reshape(-1, 2))
+        return np.searchsorted(
+            self.frames, np.array([loop.ends for loop in loops], np.intp).reshape(-1, 2)
+        )
 
 
-def agreeing(loops: Sequence[Loop], track: Track, thresholds: LoopThresholds) -> tuple[list[Loop], list[RejectedLoop]]:
+def agreeing(
+    loops: Sequence[Loop], track: Track, thresholds: LoopThresholds
+) -> tuple[list[Loop], list[RejectedLoop]]:
     """Split verified loops into consistent ones, and ones without support or in conflict with others.
 
     They are in the unit of the map of their earlier end.
@@ -234,14 +284,27 @@ def agreeing(loops: Sequence[Loop], track: Track, thresholds: LoopThresholds) ->
         T_earlier_later = invert(track.T_world_camera[earlier]) @ track.T_world_camera[later]
         drift = np.linalg.norm((T_earlier_later - loop.measured.T_from_to)[:3, 3])
         length = track.path[later] - track.path[earlier]
-        if track.worlds[earlier] == track.worlds[later] and drift > thresholds.max_drift_ratio * length:
+        if (
+            track.worlds[earlier] == track.worlds[later]
+            and drift > thresholds.max_drift_ratio * length
+        ):
             limit = f"{thresholds.max_drift_ratio:.0%}"
-            refused.append(loop.refused(f"corrects the odometry by more than {limit} of the path between its frames"))
+            refused.append(
+                loop.refused(
+                    f"corrects the odometry by more than {limit} of the path between its frames"
+                )
+            )
         else:
             possible.append(loop)
-    for loop, (supporting, conflicting) in zip(possible, _votes_by_maps(possible, track, thresholds), strict=True):
+    for loop, (supporting, conflicting) in zip(
+        possible, _votes_by_maps(possible, track, thresholds), strict=True
+    ):
         if conflicting > supporting:
-            refused.append(loop.refused(f"contradicted by {conflicting} of {conflicting + supporting} loops nearby"))
+            refused.append(
+                loop.refused(
+                    f"contradicted by {conflicting} of {conflicting + supporting} loops nearby"
+                )
+            )
         elif supporting < thresholds.min_support and loop.inliers < thresholds.alone_inliers:
             refused.append(loop.refused(f"lacks support: {supporting} loops nearby agree"))
         else:
@@ -249,20 +312,27 @@ def agreeing(loops: Sequence[Loop], track: Track, thresholds: LoopThresholds) ->
     return kept, refused
 
 
-def _votes_by_maps(loops: Sequence[Loop], track: Track, thresholds: LoopThresholds) -> NDArray[np.intp]:
+def _votes_by_maps(
+    loops: Sequence[Loop], track: Track, thresholds: LoopThresholds
+) -> NDArray[np.intp]:
     """How many loops support and conflict with each loop ``(L, 2)``: loops between the same two maps, or within one."""
     pairs, votes = track.maps[track.rows(loops)], np.zeros((len(loops), 2), np.intp)
     for first, second in np.unique(pairs, axis=0):
         chosen = np.flatnonzero((pairs == [first, second]).all(axis=1))
         between, T_world_camera = [loops[k] for k in chosen], track.T_world_camera.copy()
         if first != second:  # steps of the later map in the unit of the earlier one
-            T_world_camera[track.maps == second, :3, 3] *= np.median([loop.scale for loop in between])
+            T_world_camera[track.maps == second, :3, 3] *= np.median(
+                [loop.scale for loop in between]
+            )
         votes[chosen] = _votes(between, track.rows(between), T_world_camera, thresholds)
     return votes
 
 
 def _votes(
-    loops: Sequence[Loop], ends: NDArray[np.intp], T_world_camera: FloatArray, thresholds: LoopThresholds
+    loops: Sequence[Loop],
+    ends: NDArray[np.intp],
+    T_world_camera: FloatArray,
+    thresholds: LoopThresholds,
 ) -> list[tuple[int, int]]:
     """How many loops nearby support and conflict with each loop; loops of the same image count once."""
     T_from_to = np.array([loop.measured.T_from_to for loop in loops]).reshape(-1, 4, 4)
@@ -270,16 +340,22 @@ def _votes(
     votes = []
     for k, (earlier, later) in enumerate(ends):
         distance = np.abs(ends - ends[k])
-        near = np.flatnonzero((distance <= thresholds.support_distance).all(axis=1) & (distance[:, 1] > 0))
+        near = np.flatnonzero(
+            (distance <= thresholds.support_distance).all(axis=1) & (distance[:, 1] > 0)
+        )
         T_earlier = invert(T_world_camera[earlier]) @ T_world_camera[ends[near, 0]]
         T_later = invert(T_world_camera[ends[near, 1]]) @ T_world_camera[later]
         cycle = invert(T_from_to[k]) @ T_earlier @ T_from_to[near] @ T_later
         rotation = rotation_angle(cycle[:, :3, :3])
         translation = np.linalg.norm(cycle[:, :3, 3], axis=1)
         both = np.hypot(sigmas[near], sigmas[k])
-        length = np.linalg.norm(T_earlier[:, :3, 3], axis=1) + np.linalg.norm(T_later[:, :3, 3], axis=1)
+        length = np.linalg.norm(T_earlier[:, :3, 3], axis=1) + np.linalg.norm(
+            T_later[:, :3, 3], axis=1
+        )
         drift = np.deg2rad(thresholds.support_drift_deg) * distance[near].sum(axis=1)
         agrees = rotation < _SUPPORT_SIGMAS * both[:, 0] + drift
         agrees &= translation < _SUPPORT_SIGMAS * both[:, 3] + _SUPPORT_DRIFT_RATIO * length
-        votes.append((len(np.unique(ends[near[agrees], 1])), len(np.unique(ends[near[~agrees], 1]))))
+        votes.append(
+            (len(np.unique(ends[near[agrees], 1])), len(np.unique(ends[near[~agrees], 1])))
+        )
     return votes

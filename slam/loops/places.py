@@ -26,7 +26,9 @@ _ARRAYS = ("camera", "frames", "counts", "T_world_camera", "pixels", "descriptor
 _NEIGHBOURS = 4  # places on either side that a place is matched with
 _LEAST_SIGHTINGS = 3
 _LEAST_ANGLE = np.deg2rad(1.0)  # between two rays of a point
-_LARGEST_DEPTH_ERROR = 0.2  # of learned depth, median: on streets it is 0.06 to 0.12, in a kitchen 0.4
+_LARGEST_DEPTH_ERROR = (
+    0.2  # of learned depth, median: on streets it is 0.06 to 0.12, in a kitchen 0.4
+)
 
 Rows = NDArray[np.intp]
 
@@ -45,14 +47,22 @@ class Places:
         np.savez_compressed(
             path,
             format=np.array(_FORMAT),
-            camera=np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]),
+            camera=np.array(
+                [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
+            ),
             undistorted=np.array(camera.undistorted),
             frames=np.array([view.index for view in self.views], np.int64),
             counts=np.array([len(view) for view in self.views], np.int64),
             T_world_camera=self.T_world_camera,
-            pixels=np.concatenate([np.zeros((0, 2), np.float32), *(view.pixels for view in self.views)]),
-            descriptors=np.concatenate([np.zeros((0, 32), np.uint8), *(view.descriptors for view in self.views)]),
-            points=np.concatenate([np.zeros((0, 3), np.float32), *(view.points for view in self.views)]),
+            pixels=np.concatenate(
+                [np.zeros((0, 2), np.float32), *(view.pixels for view in self.views)]
+            ),
+            descriptors=np.concatenate(
+                [np.zeros((0, 32), np.uint8), *(view.descriptors for view in self.views)]
+            ),
+            points=np.concatenate(
+                [np.zeros((0, 3), np.float32), *(view.points for view in self.views)]
+            ),
         )
 
     @classmethod
@@ -78,7 +88,10 @@ class Places:
         width, height, *pinhole = content["camera"].tolist()
         frames, ends = content["frames"].tolist(), np.cumsum(content["counts"])
         # the part after the last view is empty
-        parts = [np.split(content[name], ends)[: len(frames)] for name in ("pixels", "descriptors", "points")]
+        parts = [
+            np.split(content[name], ends)[: len(frames)]
+            for name in ("pixels", "descriptors", "points")
+        ]
         views = tuple(View(index, *arrays) for index, *arrays in zip(frames, *parts, strict=True))
         camera = Intrinsics(int(width), int(height), *pinhole, undistorted=undistorted)
         return cls(camera, views, content["T_world_camera"])
@@ -114,7 +127,9 @@ class PlaceStructure:
         points = self._around(row).points
         if not learned:
             return points
-        by_depth = apply(self._places.T_world_camera[row], self._places.views[row].points.astype(np.float64))
+        by_depth = apply(
+            self._places.T_world_camera[row], self._places.views[row].points.astype(np.float64)
+        )
         return np.where(np.isfinite(points), points, by_depth)
 
     def pixels(self, views: Rows, corners: Rows) -> FloatArray:
@@ -148,14 +163,22 @@ class PlaceStructure:
         views = np.repeat(np.arange(len(self._places.views)), np.diff(first))
         # of two corners of a place that were joined to one point, one is wrong
         _, once = np.unique(track * len(self._places.views) + views, return_index=True)
-        return self._triangulated(views[once], once - first[views[once]], track[once], int(track.max(initial=-1)) + 1)
+        return self._triangulated(
+            views[once], once - first[views[once]], track[once], int(track.max(initial=-1)) + 1
+        )
 
     def _triangulated_around(self, row: int) -> Tracks:
         """A point for each corner of a place, by the places around it."""
         place, pairings = self._places.views[row], []
-        for other in range(max(0, row - _NEIGHBOURS), min(len(self._places.views), row + _NEIGHBOURS + 1)):
+        for other in range(
+            max(0, row - _NEIGHBOURS), min(len(self._places.views), row + _NEIGHBOURS + 1)
+        ):
             rows = np.arange(len(place))
-            pairs = (rows, rows) if other == row else matches(place, self._places.views[other], self._thresholds)
+            pairs = (
+                (rows, rows)
+                if other == row
+                else matches(place, self._places.views[other], self._thresholds)
+            )
             pairings.append((np.full(len(pairs[0]), other), *pairs))
         views, corners, seen = (np.concatenate(column) for column in zip(*pairings, strict=True))
         return self._triangulated(views, seen, corners, len(place))

@@ -74,7 +74,9 @@ class FeatureExtractor:
             fastThreshold=_CORNER_CONTRAST,
         )
 
-    def view(self, frame: Frame, depth_unscaled: DepthMap, height_unscaled: float | None = None) -> View:
+    def view(
+        self, frame: Frame, depth_unscaled: DepthMap, height_unscaled: float | None = None
+    ) -> View:
         """Features of a frame, at the size of its image.
 
         Args:
@@ -111,7 +113,9 @@ def describe(grey: Grey, pixels: NDArray[np.floating[Any]]) -> Descriptors:
     # at half the size a quarter of the pixels describe the same surroundings
     half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     corners = [
-        cv2.KeyPoint(0.5 * float(u) - 0.25, 0.5 * float(v) - 0.25, _SIFT_SIZE_PX / 2, float(angle), 1.0, 0, 0)
+        cv2.KeyPoint(
+            0.5 * float(u) - 0.25, 0.5 * float(v) - 0.25, _SIFT_SIZE_PX / 2, float(angle), 1.0, 0, 0
+        )
         for (u, v), angle in zip(pixels, _directions_deg(grey, pixels), strict=True)
     ]
     _, values = cv2.SIFT.create().compute(half, corners)
@@ -121,7 +125,9 @@ def describe(grey: Grey, pixels: NDArray[np.floating[Any]]) -> Descriptors:
 
 def hamming(first: Descriptors, second: Descriptors) -> NDArray[np.float32]:
     """Differing bits ``(M, N)`` of every pair of descriptors ``(M, 32)`` and ``(N, 32)``."""
-    words_first, words_second = (np.ascontiguousarray(d).view(np.uint64).T for d in (first, second))  # (4, M), (4, N)
+    words_first, words_second = (
+        np.ascontiguousarray(d).view(np.uint64).T for d in (first, second)
+    )  # (4, M), (4, N)
     differing = np.zeros((len(first), len(second)), np.uint16)
     for a, b in zip(words_first, words_second, strict=True):
         differing += np.bitwise_count(a[:, None] ^ b)
@@ -148,7 +154,9 @@ class PlaceIndex:
 
     def __init__(self, views: Sequence[View]) -> None:
         """Train the vocabulary on the drive's views, at least one."""
-        everything = np.concatenate([np.zeros((0, 32), np.uint8), *(view.descriptors for view in views)])
+        everything = np.concatenate(
+            [np.zeros((0, 32), np.uint8), *(view.descriptors for view in views)]
+        )
         self._words = train_vocabulary(everything, _WORDS)
         counts = _word_counts(views, nearest_words(everything, self._words))
         seen_in = np.bincount(counts.indices, minlength=_WORDS)
@@ -168,13 +176,20 @@ class PlaceIndex:
 
 def train_vocabulary(descriptors: Descriptors, words: int) -> Descriptors:
     """At most ``words`` binary words ``(K, 32)`` by k-majority (Grana et al. 2013) on an even sample of descriptors."""
-    take = np.linspace(0, len(descriptors) - 1, min(len(descriptors), _TRAINING_DESCRIPTORS)).astype(int)
+    take = np.linspace(
+        0, len(descriptors) - 1, min(len(descriptors), _TRAINING_DESCRIPTORS)
+    ).astype(int)
     sample = descriptors[take]
-    centres = np.unique(sample[np.linspace(0, len(sample) - 1, min(words, len(sample))).astype(int)], axis=0)
+    centres = np.unique(
+        sample[np.linspace(0, len(sample) - 1, min(words, len(sample))).astype(int)], axis=0
+    )
     bits = np.unpackbits(sample, axis=1).astype(np.float32)
     for _ in range(_ROUNDS if len(centres) else 0):
         word = nearest_words(sample, centres)
-        members = csr_array((np.ones(len(word), np.float32), (word, np.arange(len(word)))), (len(centres), len(word)))
+        members = csr_array(
+            (np.ones(len(word), np.float32), (word, np.arange(len(word)))),
+            (len(centres), len(word)),
+        )
         count = np.bincount(word, minlength=len(centres))[:, None]
         majority = np.packbits(members @ bits > count / 2.0, axis=1)
         centres = np.where(count > 0, majority, centres)
@@ -183,7 +198,10 @@ def train_vocabulary(descriptors: Descriptors, words: int) -> Descriptors:
 
 def nearest_words(descriptors: Descriptors, words: Descriptors) -> NDArray[np.int64]:
     """The word ``(M,)`` of each descriptor by Hamming distance."""
-    blocks = [descriptors[k : k + _BLOCK_DESCRIPTORS] for k in range(0, len(descriptors), _BLOCK_DESCRIPTORS)]
+    blocks = [
+        descriptors[k : k + _BLOCK_DESCRIPTORS]
+        for k in range(0, len(descriptors), _BLOCK_DESCRIPTORS)
+    ]
     nearest = side_by_side(lambda block: hamming(block, words).argmin(axis=1), blocks)
     return np.concatenate([np.zeros(0, np.int64), *nearest])
 
@@ -221,7 +239,9 @@ class LoopThresholds:
     min_inlier_ratio: float = 0.4  # among the matches with depth
     max_drift_ratio: float = 0.3  # correction over the path between both ends
     support_distance: int = 20  # of both ends, within which loops must agree
-    support_drift_deg: float = 0.1  # rotation drift of the odometry between supporting loops, per frame or keyframe
+    support_drift_deg: float = (
+        0.1  # rotation drift of the odometry between supporting loops, per frame or keyframe
+    )
     alone_inliers: int = 120  # from which on a loop needs no support
     rotation_floor_deg: float = 0.02  # of the sigmas
     translation_floor_ratio: float = 0.0003  # of the sigmas, over the depth
@@ -323,7 +343,11 @@ class LoopVerifier:
         if isinstance(backward, str):
             return refused(f"backwards {backward}", len(forward.inliers))
         inliers = min(len(forward.inliers), len(backward.inliers))
-        scale = _scale(points_earlier, points_later, forward, backward) if self.thresholds.has_units else 1.0
+        scale = (
+            _scale(points_earlier, points_later, forward, backward)
+            if self.thresholds.has_units
+            else 1.0
+        )
         if scale is None:
             return refused("few corners have points in both views", inliers)
         T_again = backward.T_camera_points.copy()
@@ -332,13 +356,26 @@ class LoopVerifier:
         rotation_deg = float(np.rad2deg(rotation_angle(difference[:3, :3])))
         depth = min(forward.depth, scale * backward.depth)
         translation_ratio = float(np.linalg.norm(difference[:3, 3])) / depth
-        if rotation_deg > self.thresholds.agreement_deg or translation_ratio > self.thresholds.agreement_ratio:
+        if (
+            rotation_deg > self.thresholds.agreement_deg
+            or translation_ratio > self.thresholds.agreement_ratio
+        ):
             reason = f"both directions differ by {rotation_deg:.1f} degrees and {translation_ratio:.0%} of the depth"
             return refused(reason, inliers)
         T_forward = invert(forward.T_camera_points)
-        half = Rotation.from_rotvec(0.5 * Rotation.from_matrix(T_forward[:3, :3].T @ T_again[:3, :3]).as_rotvec())
-        T_middle = make(T_forward[:3, :3] @ half.as_matrix(), 0.5 * (T_forward[:3, 3] + T_again[:3, 3]))
-        sigmas = self._sigmas(T_middle, depth, difference, forward.sigmas, backward.sigmas * np.repeat([1.0, scale], 3))
+        half = Rotation.from_rotvec(
+            0.5 * Rotation.from_matrix(T_forward[:3, :3].T @ T_again[:3, :3]).as_rotvec()
+        )
+        T_middle = make(
+            T_forward[:3, :3] @ half.as_matrix(), 0.5 * (T_forward[:3, 3] + T_again[:3, 3])
+        )
+        sigmas = self._sigmas(
+            T_middle,
+            depth,
+            difference,
+            forward.sigmas,
+            backward.sigmas * np.repeat([1.0, scale], 3),
+        )
         measured = RelativePose(earlier.index, later.index, T_middle, sigmas, LOOP_SOURCE)
         shared = np.union1d(forward.inliers, backward.inliers)
         corners = np.column_stack([rows_earlier[shared], rows_later[shared]])
@@ -349,22 +386,40 @@ class LoopVerifier:
         """The camera that sees points ``(M, 3)``, NaN where unknown, at pixels ``(M, 2)``; or why not."""
         thresholds, K = self.thresholds, self._intrinsics.K
         known = np.flatnonzero(np.isfinite(points).all(axis=1))
-        points_known, pixels_known = points[known].astype(np.float64), pixels[known].astype(np.float64)
+        points_known, pixels_known = (
+            points[known].astype(np.float64),
+            pixels[known].astype(np.float64),
+        )
         if len(known) < thresholds.min_inliers:
             return f"only {len(known)} matches have a trusted depth"
         tolerance, iterations = thresholds.reprojection_px, _RANSAC_ITERATIONS
-        T_start, inliers = consensus(points_known, pixels_known, K, iterations, tolerance, self._seed)
+        T_start, inliers = consensus(
+            points_known, pixels_known, K, iterations, tolerance, self._seed
+        )
         count = len(inliers)
         if count < thresholds.min_inliers or count < thresholds.min_inlier_ratio * len(known):
             return f"only {count} of {len(known)} matches are inliers"
-        extent = pixels_known[inliers].std(axis=0) / [self._intrinsics.width, self._intrinsics.height]
+        extent = pixels_known[inliers].std(axis=0) / [
+            self._intrinsics.width,
+            self._intrinsics.height,
+        ]
         if extent[0] < _MIN_SPREAD_RATIO or extent[1] < _MIN_SPREAD_RATIO / 2:
             return f"{count} inliers in a small part of the image"
         seen = resect([T_start], points_known[inliers], pixels_known[inliers], K)
-        return Sighting(seen.T_camera_world, seen.sigmas, known[inliers], float(np.median(points_known[inliers, 2])))
+        return Sighting(
+            seen.T_camera_world,
+            seen.sigmas,
+            known[inliers],
+            float(np.median(points_known[inliers, 2])),
+        )
 
     def _sigmas(
-        self, T_a_b: FloatArray, depth: float, difference: FloatArray, forward: FloatArray, backward: FloatArray
+        self,
+        T_a_b: FloatArray,
+        depth: float,
+        difference: FloatArray,
+        forward: FloatArray,
+        backward: FloatArray,
     ) -> FloatArray:
         """Sigmas ``(6,)`` in camera b: of corners, of learned depth, and half the difference of both directions.
 
@@ -379,7 +434,9 @@ class LoopVerifier:
         return np.asarray(np.linalg.norm([corners, disagreement, floors], axis=0))
 
 
-def matches(first: View, second: View, thresholds: LoopThresholds) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def matches(
+    first: View, second: View, thresholds: LoopThresholds
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows of mutual nearest neighbours by Hamming distance that pass Lowe's ratio test."""
     if min(len(first), len(second)) < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
@@ -393,7 +450,10 @@ def matches(first: View, second: View, thresholds: LoopThresholds) -> tuple[NDAr
 
 
 def _scale(
-    points_first: NDArray[np.float32], points_second: NDArray[np.float32], forward: Sighting, backward: Sighting
+    points_first: NDArray[np.float32],
+    points_second: NDArray[np.float32],
+    forward: Sighting,
+    backward: Sighting,
 ) -> float | None:
     """The unit of the second view in that of the first, by the depths of points that both have."""
     both = np.intersect1d(forward.inliers, backward.inliers)
@@ -401,5 +461,8 @@ def _scale(
         return None
     seen_by_second = apply(forward.T_camera_points, points_first[both].astype(np.float64))[:, 2]
     seen_by_first = apply(backward.T_camera_points, points_second[both].astype(np.float64))[:, 2]
-    ratios = np.median(seen_by_second / points_second[both, 2]), np.median(points_first[both, 2] / seen_by_first)
+    ratios = (
+        np.median(seen_by_second / points_second[both, 2]),
+        np.median(points_first[both, 2] / seen_by_first),
+    )
     return float(np.sqrt(ratios[0] * ratios[1]))

@@ -77,7 +77,10 @@ class DepthFilters:
         return dict(zip(FILTERS, (self._taken / max(self._frames, 1)).tolist(), strict=True))
 
     def kept(
-        self, view: KeyframeDepth, others: Sequence[KeyframeDepth], earlier: KeyframeDepth | None = None
+        self,
+        view: KeyframeDepth,
+        others: Sequence[KeyframeDepth],
+        earlier: KeyframeDepth | None = None,
     ) -> DepthMap:
         """The depth to fuse ``(H, W)``, 0 elsewhere.
 
@@ -100,13 +103,17 @@ class DepthFilters:
             (depth >= config.depth_min_m) & (depth < farthest),
             everything if view.relative_sigma is None else sigma <= MOST_RELATIVE_SIGMA,
             ~_at_edges(self.trusted(view), _MAX_DEPTH_STEP) | is_exact,
-            np.any([self._agrees(view, other) for other in others], axis=0) if others else everything,
+            np.any([self._agrees(view, other) for other in others], axis=0)
+            if others
+            else everything,
             everything if earlier is None else ~self._is_seen_through(view, earlier),
         )
         left = everything
         for number, mask in enumerate(masks):
             remaining = left & mask
-            self._taken[number] += (np.count_nonzero(left) - np.count_nonzero(remaining)) / depth.size
+            self._taken[number] += (
+                np.count_nonzero(left) - np.count_nonzero(remaining)
+            ) / depth.size
             left = remaining
         self._frames += 1
         return np.where(left, depth, np.float32(0))
@@ -117,12 +124,17 @@ class DepthFilters:
             return view.depth
         return np.where(view.relative_sigma <= MOST_RELATIVE_SIGMA, view.depth, np.float32(0))
 
-    def projected(self, view: KeyframeDepth, other: KeyframeDepth) -> tuple[DepthMap, DepthMap, DepthMap]:
+    def projected(
+        self, view: KeyframeDepth, other: KeyframeDepth
+    ) -> tuple[DepthMap, DepthMap, DepthMap]:
         """Columns, rows and depth ``(H, W)`` of a view's pixels in the other; unknown ones lie outside of it."""
         T_other_camera = (invert(other.T_world_camera) @ view.T_world_camera).astype(np.float32)
         K = self._camera.K.astype(np.float32)
         turned, moved = K @ T_other_camera[:3, :3] @ self._rays, K @ T_other_camera[:3, 3]
-        x, y, z = (row.reshape(view.depth.shape) * view.depth + m for row, m in zip(turned, moved, strict=True))
+        x, y, z = (
+            row.reshape(view.depth.shape) * view.depth + m
+            for row, m in zip(turned, moved, strict=True)
+        )
         ahead = (z > 1e-3) & (view.depth > 0)
         before = np.where(ahead, z, np.float32(1))
         return np.where(ahead, x / before, np.float32(_OUTSIDE)), y / before, z
@@ -155,18 +167,25 @@ class DepthFilters:
         """Pixels ``(H, W)`` of pieces behind which the earlier view sees something."""
         u, v, z = self.projected(view, earlier)
         behind = sampled(self.trusted(earlier), u, v) > np.float32(_BEHIND) * z
-        return np.asarray(cv2.morphologyEx(behind.view(np.uint8), cv2.MORPH_OPEN, _PIECE), dtype=bool)
+        return np.asarray(
+            cv2.morphologyEx(behind.view(np.uint8), cv2.MORPH_OPEN, _PIECE), dtype=bool
+        )
 
 
 def sampled(image: NDArray[Any], u: DepthMap, v: DepthMap) -> NDArray[Any]:
     """The pixels of an image nearest to columns and rows ``(H, W)``, 0 outside of it."""
-    return np.asarray(cv2.remap(image, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0))
+    return np.asarray(
+        cv2.remap(image, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    )
 
 
 def _at_edges(depth: DepthMap, max_step: float) -> Mask:
     """Pixels on either side of a relative depth step, where networks blur depth."""
     edges = np.zeros(depth.shape, dtype=bool)
-    for near, far in (((slice(None), slice(1, None)), (slice(None), slice(-1))), ((slice(1, None),), (slice(-1),))):
+    for near, far in (
+        ((slice(None), slice(1, None)), (slice(None), slice(-1))),
+        ((slice(1, None),), (slice(-1),)),
+    ):
         a, b = depth[near], depth[far]
         step = np.abs(a - b) > max_step * np.minimum(a, b)
         edges[near] |= step
@@ -209,7 +228,9 @@ class DepthRefiner:
         unknown = ~(np.isfinite(depth) & (depth > 0))
         if unknown.all():
             return None
-        chosen = neighbours_around(self._T_world_camera, n, float(np.median(depth[~unknown])), self._indices)
+        chosen = neighbours_around(
+            self._T_world_camera, n, float(np.median(depth[~unknown])), self._indices
+        )
         if not chosen:
             return None
         if unknown.any():
@@ -217,7 +238,9 @@ class DepthRefiner:
             depth = depth[tuple(nearest)]
         T_neighbour_target = invert(self._T_world_camera[chosen]) @ self._T_world_camera[n]
         others = [self._appearance(k) for k in chosen]
-        measurement = measure(self._appearance(n), depth, others, self._intrinsics.K, T_neighbour_target)
+        measurement = measure(
+            self._appearance(n), depth, others, self._intrinsics.K, T_neighbour_target
+        )
         refined = self._decide(measurement)
         refined.relative_sigma[unknown & ~refined.measured] = np.inf
         return refined

@@ -19,7 +19,9 @@ from slam.mapping.surface import MapSurface
 from slam.runtime.errors import EmptyMapError
 from slam.runtime.resources import SpillFile
 
-_FUSION_SHARE = 0.25  # of the memory: growing needs twice the blocks, and the rest of the map has its own
+_FUSION_SHARE = (
+    0.25  # of the memory: growing needs twice the blocks, and the rest of the map has its own
+)
 _BLOCK_MB = BLOCK_VOXELS * 8 / 2**20
 _SUBMAP_LENGTH = 3.0  # largest depths after which a submap ends: 60 m of a street
 _EARLIER = 3  # views between one and that which tells what has come since
@@ -51,7 +53,9 @@ class TsdfMap:
             SlamError: the disk is full.
         """
         depth = keyframe.depth
-        known_depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0)).astype(np.float32)
+        known_depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0)).astype(
+            np.float32
+        )
         view = replace(keyframe, depth=known_depth, network_depth=None)
         if not self._filters.trusted(view).any():
             self._left_out += 1
@@ -95,7 +99,13 @@ class TsdfMap:
     def statistics(self) -> dict[str, Any]:
         """Sizes of all that was given so far, zero for an empty map, and the share of pixels that each filter took."""
         self._fuse_waiting(None)
-        sizes = {"triangles": 0, "points": 0, "blocks": 0, "submaps": len(self._finished), "floater_share": 0.0}
+        sizes = {
+            "triangles": 0,
+            "points": 0,
+            "blocks": 0,
+            "submaps": len(self._finished),
+            "floater_share": 0.0,
+        }
         with suppress(EmptyMapError):
             surface = self.surface()
             sizes = {name: getattr(surface, name) for name in sizes}

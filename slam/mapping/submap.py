@@ -29,7 +29,9 @@ SpilledSubmap = dict[str, SpilledArray]  # the fields of a `Submap` on disk
 BLOCK_SIDE = 16
 BLOCK_VOXELS = BLOCK_SIDE**3
 TILE_BLOCKS = 16
-SEED_STRIDE = 4  # Open3D activates blocks at these pixels only, and raises where none of them has depth
+SEED_STRIDE = (
+    4  # Open3D activates blocks at these pixels only, and raises where none of them has depth
+)
 TRUNCATION_VOXELS = 10.0  # of the signed distance: 4 lose completeness, 12 accuracy (docs/design/tried-without-success)
 _CAPACITY = 1000  # blocks of 32 KiB; growing takes Open3D a moment
 _MOST_WEIGHT = np.iinfo(np.uint16).max
@@ -119,7 +121,9 @@ class Fusion:
         how = (self._K, T_camera_world, 1.0, self._reach, TRUNCATION_VOXELS)
         self._grid.integrate(self._grid.compute_unique_block_coordinates(image, *how), image, *how)
         position = T_world_camera[:3, 3]
-        self.length += 0.0 if self._position is None else float(np.linalg.norm(position - self._position))
+        self.length += (
+            0.0 if self._position is None else float(np.linalg.norm(position - self._position))
+        )
         self._position = position
         return True
 
@@ -130,9 +134,19 @@ class Fusion:
         order = np.lexsort(keys.T)  # that of Open3D's threads is not reproducible
         weight = self._grid.attribute("weight").numpy().reshape(-1, BLOCK_VOXELS)[places[order]]
         seen = weight > 0
-        tsdf = self._grid.attribute("tsdf").numpy().reshape(-1, BLOCK_VOXELS)[places[order]][seen].astype(np.float16)
+        tsdf = (
+            self._grid.attribute("tsdf")
+            .numpy()
+            .reshape(-1, BLOCK_VOXELS)[places[order]][seen]
+            .astype(np.float16)
+        )
         weights = np.minimum(weight[seen], _MOST_WEIGHT).astype(np.uint16)
-        return {"keys": keys[order], "observed": np.packbits(seen, axis=1), "tsdf": tsdf, "weight": weights}
+        return {
+            "keys": keys[order],
+            "observed": np.packbits(seen, axis=1),
+            "tsdf": tsdf,
+            "weight": weights,
+        }
 
 
 class MergedSubmaps:
@@ -141,11 +155,17 @@ class MergedSubmaps:
     def __init__(self, submaps: Sequence[SpilledSubmap]) -> None:
         """Read what stays in memory of at least one submap."""
         self._keys: list[Keys] = [submap["keys"].read().astype(np.int64) for submap in submaps]
-        poses, steps = ([submap[name].read() for submap in submaps] for name in ("T_world_camera", "brightness_steps"))
+        poses, steps = (
+            [submap[name].read() for submap in submaps]
+            for name in ("T_world_camera", "brightness_steps")
+        )
         self.T_world_views: FloatArray = np.concatenate(poses)
         self.brightness_steps: FloatArray = np.concatenate(steps)
         self.submap_of_view = np.repeat(np.arange(len(submaps)), [len(each) for each in steps])
-        self.count, self.blocks = len(self._keys), len(np.unique(np.concatenate(self._keys), axis=0))
+        self.count, self.blocks = (
+            len(self._keys),
+            len(np.unique(np.concatenate(self._keys), axis=0)),
+        )
 
         @lru_cache(maxsize=_REMEMBERED)
         def read(number: int) -> Submap:
@@ -159,13 +179,17 @@ class MergedSubmaps:
         _, first = np.unique(tiles, axis=0, return_index=True)
         return tiles[np.sort(first)]
 
-    def merged(self, low: Keys, high: Keys) -> tuple[Keys, NDArray[np.float32], NDArray[np.float32]]:
+    def merged(
+        self, low: Keys, high: Keys
+    ) -> tuple[Keys, NDArray[np.float32], NDArray[np.float32]]:
         """Blocks with ``low <= key < high``: the weighted means of the blocks of all submaps.
 
         Coordinates ``(B, 3)``, distances ``(B, 4096)`` in truncation distances, and weights ``(B, 4096)``.
         """
         inside = [np.asarray(((keys >= low) & (keys < high)).all(axis=1)) for keys in self._keys]
-        keys = np.unique(np.concatenate([own[mask] for own, mask in zip(self._keys, inside)]), axis=0)
+        keys = np.unique(
+            np.concatenate([own[mask] for own, mask in zip(self._keys, inside)]), axis=0
+        )
         weight = np.zeros((len(keys), BLOCK_VOXELS), np.float32)
         total = np.zeros_like(weight)
 
@@ -203,12 +227,16 @@ class ViewChooser:
 
     def add(self, view: KeyframeDepth, kept: DepthMap) -> None:
         """A fused frame with the depth that passed the filters."""
-        if self._begin is not None and has_moved(view.T_world_camera, self._begin, self._step_m, _STEP_DEG):
+        if self._begin is not None and has_moved(
+            view.T_world_camera, self._begin, self._step_m, _STEP_DEG
+        ):
             self._close()
         if self._begin is None:
             self._begin = view.T_world_camera
         grey = _grey(view.image)
-        sharpness = float(cv2.Laplacian(grey, cv2.CV_64F).var() / (grey.var() + 1.0))  # contrast does not count
+        sharpness = float(
+            cv2.Laplacian(grey, cv2.CV_64F).var() / (grey.var() + 1.0)
+        )  # contrast does not count
         if self._best is None or sharpness > self._best[0]:
             self._best = sharpness, replace(view, depth=kept, relative_sigma=None)
 
@@ -220,8 +248,12 @@ class ViewChooser:
         height, width = camera.height, camera.width
         return {
             "T_world_camera": np.array([view.T_world_camera for view in views]).reshape(-1, 4, 4),
-            "images": np.array([view.image for view in views], dtype=np.uint8).reshape(-1, height, width, 3),
-            "depths": np.array([view.depth for view in views], dtype=np.float16).reshape(-1, height, width),
+            "images": np.array([view.image for view in views], dtype=np.uint8).reshape(
+                -1, height, width, 3
+            ),
+            "depths": np.array([view.depth for view in views], dtype=np.float16).reshape(
+                -1, height, width
+            ),
             "brightness_steps": np.array(steps, dtype=np.float64),
             "camera": np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
         }
@@ -229,7 +261,9 @@ class ViewChooser:
     def _close(self) -> None:
         if self._best is not None:
             _, view = self._best
-            self._steps.append(np.nan if self._last is None else self._brightness_step(view, self._last))
+            self._steps.append(
+                np.nan if self._last is None else self._brightness_step(view, self._last)
+            )
             self._chosen.append(view)
             self._last = view
         self._begin = self._best = None
@@ -238,14 +272,19 @@ class ViewChooser:
         """Logarithm of the brightness of surfaces that two views share, over that in the one before."""
         u, v, z = self._filters.projected(view, before)
         same = np.abs(sampled(before.depth, u, v) - z) < _SAME_SURFACE * z
-        here, there = (grey[same][::_STRIDE] for grey in (_grey(view.image), sampled(_grey(before.image), u, v)))
+        here, there = (
+            grey[same][::_STRIDE]
+            for grey in (_grey(view.image), sampled(_grey(before.image), u, v))
+        )
         usable = (np.minimum(here, there) > _DARK) & (np.maximum(here, there) < _BRIGHT)
         if usable.sum() < _LEAST_SHARED:
             return float("nan")
         return float(np.median(np.log(here[usable]) - np.log(there[usable])))
 
 
-def has_moved(T_world_camera: FloatArray, T_world_before: FloatArray, step_m: float, turn_deg: float) -> bool:
+def has_moved(
+    T_world_camera: FloatArray, T_world_before: FloatArray, step_m: float, turn_deg: float
+) -> bool:
     """Whether a camera has moved by a step or a turn."""
     T_before_camera = invert(T_world_before) @ T_world_camera
     turned = float(rotation_angle(T_before_camera[:3, :3]))
@@ -290,7 +329,9 @@ class Painter:
             colours[~shown] = colours[shown][nearest]
         return np.asarray(np.rint(np.clip(colours, 0, 255)), np.uint8)
 
-    def _add(self, view: int, points_world: FloatArray, total: FloatArray, weight: FloatArray) -> None:
+    def _add(
+        self, view: int, points_world: FloatArray, total: FloatArray, weight: FloatArray
+    ) -> None:
         """Add the colours of one view to those of the points that it shows."""
         number = int(self._submaps.submap_of_view[view])
         submap = self._submaps.read(number)
@@ -303,9 +344,16 @@ class Painter:
         depth, image = submap.depths[own], submap.images[own]
         u, v = np.rint(fx * x / z + cx), np.rint(fy * y / z + cy)
         inside = (u >= 0) & (u < depth.shape[1]) & (v >= 0) & (v < depth.shape[0])
-        u, v, z, ahead = u[inside].astype(np.intp), v[inside].astype(np.intp), z[inside], ahead[inside]
+        u, v, z, ahead = (
+            u[inside].astype(np.intp),
+            v[inside].astype(np.intp),
+            z[inside],
+            ahead[inside],
+        )
         known = depth[v, u]
-        same = (known > 0) & (np.abs(known - z) < np.maximum(_SAME_VOXELS * self._voxel, _SAME_SURFACE * z))
+        same = (known > 0) & (
+            np.abs(known - z) < np.maximum(_SAME_VOXELS * self._voxel, _SAME_SURFACE * z)
+        )
         shown, share = ahead[same], z[same] ** -_NEARNESS
         weight[shown] += share
         total[shown] += share[:, None] * (self._gains[view] * image[v[same], u[same]])

@@ -24,7 +24,15 @@ from slam.config.sections import MappingConfig
 from slam.formats.ply import Ply, write_ply_pieces
 from slam.frames import Mask
 from slam.geometry.se3 import FloatArray
-from slam.mapping.submap import BLOCK_SIDE, TILE_BLOCKS, Keys, MergedSubmaps, Painter, SpilledSubmap, new_grid
+from slam.mapping.submap import (
+    BLOCK_SIDE,
+    TILE_BLOCKS,
+    Keys,
+    MergedSubmaps,
+    Painter,
+    SpilledSubmap,
+    new_grid,
+)
 from slam.runtime.errors import EmptyMapError
 from slam.runtime.imports import import_open3d
 from slam.runtime.resources import SpilledArray, SpillFile
@@ -73,7 +81,9 @@ class _Rows:
 class MapSurface:
     """The cleaned surface of finished submaps."""
 
-    def __init__(self, finished: Sequence[SpilledSubmap], config: MappingConfig, progress: Progress = silent) -> None:
+    def __init__(
+        self, finished: Sequence[SpilledSubmap], config: MappingConfig, progress: Progress = silent
+    ) -> None:
         """Merge the submaps and extract their surface.
 
         Raises:
@@ -95,7 +105,9 @@ class MapSurface:
                 middle = (tile + 0.5) * TILE_BLOCKS * BLOCK_SIDE * config.voxel_size_m
                 nearest = np.linalg.norm(submaps.T_world_views[:, :3, 3] - middle, axis=1).argmin()
                 up = -submaps.T_world_views[nearest, :3, 1]
-                patch = with_holes_closed(patch, tile, config.voxel_size_m, up, config.close_holes_m)
+                patch = with_holes_closed(
+                    patch, tile, config.voxel_size_m, up, config.close_holes_m
+                )
             if patch is not None and patch.own.any():
                 self._pieces.append(_piece(patch, painter, self._spill))
             progress("mesh", done, len(tiles))
@@ -104,7 +116,9 @@ class MapSurface:
         self._rows = _numbered(self._pieces, _LEAST_TRIANGLES, self._spill)
         self.triangles = sum(rows.triangles for rows in self._rows)
         if self.triangles == 0:
-            raise EmptyMapError(f"the map is empty: no piece of surface is larger than {_LEAST_TRIANGLES} triangles")
+            raise EmptyMapError(
+                f"the map is empty: no piece of surface is larger than {_LEAST_TRIANGLES} triangles"
+            )
         everything = sum(int(piece.sizes.sum()) for piece in self._pieces)
         self.floater_share = 1 - self.triangles / everything
         sizes = [(len(each), int((each["filled"] == 0).sum())) for each in self.vertex_pieces()]
@@ -136,7 +150,14 @@ class MapSurface:
 
     def write_mesh(self, path: Path) -> None:
         """Write the mesh as binary PLY, atomically; ``RunError`` where that fails."""
-        write_ply_pieces(path, _FILLED, self.vertices, self.vertex_pieces(), self.triangles, self.triangle_pieces())
+        write_ply_pieces(
+            path,
+            _FILLED,
+            self.vertices,
+            self.vertex_pieces(),
+            self.triangles,
+            self.triangle_pieces(),
+        )
 
     def write_cloud(self, path: Path) -> None:
         """Write the cloud as binary PLY, atomically; ``RunError`` where that fails."""
@@ -161,7 +182,9 @@ def _piece(patch: TileSurface, painter: Painter, spill: SpillFile) -> Piece:
         vertices[name] = shade
     vertices["filled"] = filled[used]
     ends = np.concatenate([triangles[:, :2], triangles[:, 1:]])
-    links = coo_array((np.ones(len(ends), dtype=bool), (ends[:, 0], ends[:, 1])), shape=(len(used), len(used)))
+    links = coo_array(
+        (np.ones(len(ends), dtype=bool), (ends[:, 0], ends[:, 1])), shape=(len(used), len(used))
+    )
     parts, label = connected_components(links, directed=False)
     shared = np.flatnonzero(is_outside[used])
     put = spill.put
@@ -183,9 +206,15 @@ def _numbered(pieces: list[Piece], least_triangles: int, spill: SpillFile) -> li
     part = np.concatenate([first + piece.shared_labels for first, piece in zip(begin, pieces)])
     _, earliest, group = np.unique(points, axis=0, return_index=True, return_inverse=True)
     group = group.ravel()
-    link = coo_array((np.ones(len(part), dtype=bool), (part, part[earliest[group]])), shape=(begin[-1], begin[-1]))
+    link = coo_array(
+        (np.ones(len(part), dtype=bool), (part, part[earliest[group]])),
+        shape=(begin[-1], begin[-1]),
+    )
     _, whole = connected_components(link, directed=False)
-    kept_part = np.bincount(whole, weights=np.concatenate([piece.sizes for piece in pieces]))[whole] >= least_triangles
+    kept_part = (
+        np.bincount(whole, weights=np.concatenate([piece.sizes for piece in pieces]))[whole]
+        >= least_triangles
+    )
     row_of_group = np.full(len(earliest), -1)
     rows, place, written = [], 0, 0
     for first, last, piece in zip(begin, begin[1:], pieces):
@@ -199,7 +228,9 @@ def _numbered(pieces: list[Piece], least_triangles: int, spill: SpillFile) -> li
         numbers[own] = np.arange(written, written + count)
         row_of_group[groups[is_first]] = numbers[firsts]
         numbers[other] = row_of_group[groups[~is_first]]
-        rows.append(_Rows(spill.put(numbers), written, int(piece.sizes[kept_part[first:last]].sum())))
+        rows.append(
+            _Rows(spill.put(numbers), written, int(piece.sizes[kept_part[first:last]].sum()))
+        )
         place, written = place + len(groups), written + count
     return rows
 
@@ -217,8 +248,12 @@ class TileSurface:
         """Unit normals ``(V, 3)``: means of the triangles around each vertex, by their area."""
         o3d = import_open3d()
         vertices = o3d.utility.Vector3dVector(self.vertices)
-        triangles = o3d.utility.Vector3iVector(self.triangles.astype(np.int32))  # others are converted one by one
-        return np.asarray(o3d.geometry.TriangleMesh(vertices, triangles).compute_vertex_normals().vertex_normals)
+        triangles = o3d.utility.Vector3iVector(
+            self.triangles.astype(np.int32)
+        )  # others are converted one by one
+        return np.asarray(
+            o3d.geometry.TriangleMesh(vertices, triangles).compute_vertex_normals().vertex_normals
+        )
 
 
 def extract_tile(
@@ -247,7 +282,11 @@ def in_tile(points: FloatArray, tile: NDArray[np.int64], voxel_size_m: float) ->
 
 
 def _extract(
-    keys: Keys, tsdf: NDArray[np.float32], weight: NDArray[np.float32], voxel_size_m: float, least_weight: float
+    keys: Keys,
+    tsdf: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    voxel_size_m: float,
+    least_weight: float,
 ) -> tuple[FloatArray, Triangles] | None:
     o3d = import_open3d()
     grid: Any = new_grid(voxel_size_m, len(keys))
@@ -262,18 +301,24 @@ def _extract(
         return None
     if mesh.is_empty() or not len(mesh.triangle.indices):
         return None
-    return mesh.vertex.positions.numpy().astype(np.float64), mesh.triangle.indices.numpy().astype(np.int64)
+    return mesh.vertex.positions.numpy().astype(np.float64), mesh.triangle.indices.numpy().astype(
+        np.int64
+    )
 
 
 def _sorted(vertices: FloatArray, triangles: Triangles) -> tuple[FloatArray, Triangles]:
     """The same mesh in an order that does not depend on Open3D's threads."""
     order = np.lexsort(vertices.T)
     differs = (np.diff(vertices[order], axis=0) != 0).any(axis=1)
-    if not differs.all():  # several vertices in one place: by the places that the triangles around them reach
+    if (
+        not differs.all()
+    ):  # several vertices in one place: by the places that the triangles around them reach
         place = np.empty_like(order)
         place[order] = np.append(0, np.cumsum(differs))
         reached = np.zeros(len(vertices), dtype=np.int64)
-        np.add.at(reached, triangles, (place[triangles] ** 2).sum(axis=1)[:, None])  # of integers, in any order
+        np.add.at(
+            reached, triangles, (place[triangles] ** 2).sum(axis=1)[:, None]
+        )  # of integers, in any order
         order = np.lexsort((reached, *vertices.T))
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
@@ -284,7 +329,11 @@ def _sorted(vertices: FloatArray, triangles: Triangles) -> tuple[FloatArray, Tri
 
 
 def with_holes_closed(
-    patch: TileSurface, tile: NDArray[np.int64], voxel_size_m: float, up_world: FloatArray, largest_m: float
+    patch: TileSurface,
+    tile: NDArray[np.int64],
+    voxel_size_m: float,
+    up_world: FloatArray,
+    largest_m: float,
 ) -> TileSurface:
     """Close holes of at most ``largest_m`` across by triangles around a new vertex in their middle.
 
@@ -307,7 +356,9 @@ def with_holes_closed(
         triangles.append(np.stack([np.roll(ring, -1), ring, np.full(len(ring), count)], axis=1))
         own.append(np.repeat(in_tile(middle[None], tile, voxel_size_m), len(ring)))
         count += 1
-    filled = np.concatenate([np.full(len(each), number > 0) for number, each in enumerate(triangles)])
+    filled = np.concatenate(
+        [np.full(len(each), number > 0) for number, each in enumerate(triangles)]
+    )
     return replace(
         patch,
         vertices=np.concatenate(vertices),
@@ -339,7 +390,9 @@ def _rings(triangles: Triangles, upwards: FloatArray) -> list[NDArray[np.int64]]
     """
     vertices = len(upwards)
     begin, end = _open_edges(triangles, vertices)
-    simple = (np.bincount(begin, minlength=vertices) == 1) & (np.bincount(end, minlength=vertices) == 1)
+    simple = (np.bincount(begin, minlength=vertices) == 1) & (
+        np.bincount(end, minlength=vertices) == 1
+    )
     link = coo_array((np.ones(len(begin), dtype=bool), (begin, end)), shape=(vertices, vertices))
     _, label = connected_components(link, directed=False)
     broken = np.zeros(vertices, dtype=bool)  # rings that touch themselves

@@ -21,7 +21,9 @@ _LEAST_COMPARED = 30
 _LEAST_STANDING = 0.02  # of the image
 
 
-def require_possible(sequence: Sequence, config: SlamConfig, shortest: int, has_gps: bool = False) -> None:
+def require_possible(
+    sequence: Sequence, config: SlamConfig, shortest: int, has_gps: bool = False
+) -> None:
     """Check that a sequence has what the configuration of a run needs.
 
     Args:
@@ -41,7 +43,9 @@ def require_possible(sequence: Sequence, config: SlamConfig, shortest: int, has_
         )
     mode = resolve_mode(config.scale, sequence.camera_height_m, has_gps)
     wants_lidar = {"scale.mode=lidar": mode == "lidar", "lidar.factors=true": config.lidar.factors}
-    for setting in (name for name, is_wanted in wants_lidar.items() if is_wanted and not has_scans(sequence)):
+    for setting in (
+        name for name, is_wanted in wants_lidar.items() if is_wanted and not has_scans(sequence)
+    ):
         raise SlamError(
             f"{setting} needs LiDAR scans of neighbouring frames and their calibration; {sequence.name} has none: "
             "leave the setting out or give a sequence with scans"
@@ -52,14 +56,18 @@ def require_possible(sequence: Sequence, config: SlamConfig, shortest: int, has_
             "choose scale.mode=lidar or give a camera height"
         )
     if mode == "reference" and sequence.reference is None:
-        raise SlamError(f"scale mode reference needs true poses; {sequence.name} has none: choose another scale.mode")
+        raise SlamError(
+            f"scale mode reference needs true poses; {sequence.name} has none: choose another scale.mode"
+        )
     if mode == "camera-height" and sequence.camera_height_m is None:
         raise SlamError(
             f"scale mode camera-height needs a known height; {sequence.name} has none: give a camera.yaml "
             "with camera_height_m (fov=DEGREES has none) or choose scale.mode=none"
         )
     if mode == "gps" and not has_gps:
-        raise SlamError("scale mode gps needs a GPS track: give --gps FILE or choose another scale.mode")
+        raise SlamError(
+            "scale mode gps needs a GPS track: give --gps FILE or choose another scale.mode"
+        )
     if mode == "known" and grows:
         raise SlamError(
             f"scale mode known needs frames of a whole sequence, and {sequence.name} grows: choose another scale.mode"

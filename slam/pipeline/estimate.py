@@ -105,7 +105,11 @@ def fuse(
     ``decide`` is between learned and measured depth, None where it is not refined; ``compare`` is called with each
     keyframe's depth.
     """
-    drive, scales, T_world_camera = estimate.drive, estimate.scale.per_frame, estimate.optimised.T_world_camera
+    drive, scales, T_world_camera = (
+        estimate.drive,
+        estimate.scale.per_frame,
+        estimate.optimised.T_world_camera,
+    )
     height, width = drive.keyframes[0].depth_unscaled.shape
     intrinsics = intrinsics.resized(width, height)
     guess_sigma = _ROOM_SIGMA if drive.maps and config.depth.is_learned else None
@@ -150,10 +154,16 @@ def keyframe_depths(
     ``scale_per_frame`` ``(N,)`` and ``T_world_camera`` ``(N, 4, 4)`` are of all frames. ``guess_sigma`` is that of
     depth that was to be refined and has no neighbours, None for none.
     """
-    keyframes, refiner, error = drive.keyframes, None, DepthError() if drive.maps else drive.depth_error
+    keyframes, refiner, error = (
+        drive.keyframes,
+        None,
+        DepthError() if drive.maps else drive.depth_error,
+    )
     if decide is not None:
         indices = [keyframe.index for keyframe in keyframes]
-        refiner = DepthRefiner(intrinsics, indices, T_world_camera[indices], lambda n: keyframes[n].image, decide)
+        refiner = DepthRefiner(
+            intrinsics, indices, T_world_camera[indices], lambda n: keyframes[n].image, decide
+        )
 
     def depth_at(n: int) -> KeyframeDepth:
         keyframe = keyframes[n]

@@ -38,10 +38,17 @@ FrontEnd = Literal["steps", "both", "keyframes"]
 
 # looked back for the frame before, and keyframes that give the unit
 _FRAMES, _KEYFRAMES = 40, 20
-_CLEAR_STEPS, _MOST_STEPS = 10, 30  # triangulated steps after which auto decides, if it is clear, or however that is
+_CLEAR_STEPS, _MOST_STEPS = (
+    10,
+    30,
+)  # triangulated steps after which auto decides, if it is clear, or however that is
 _VEHICLE_SCATTER_DEG = 10.0  # median angle of a vehicle's steps to their usual direction, degrees
-_CLEAR_SCATTER_DEG = 5.0  # of a camera that is carried: a vehicle's first steps scatter by 2 degrees
-_VEHICLE_SPEED = 1.5  # camera heights a second: a car at 9 km/h; a robot, a drone and a walker have less
+_CLEAR_SCATTER_DEG = (
+    5.0  # of a camera that is carried: a vehicle's first steps scatter by 2 degrees
+)
+_VEHICLE_SPEED = (
+    1.5  # camera heights a second: a car at 9 km/h; a robot, a drone and a walker have less
+)
 # keyframes that share so many tracks are in one place already
 _CONNECTED = 10
 _NEIGHBOURS = 3
@@ -88,7 +95,9 @@ class KeyframeTracking:
         self._cores = ExitStack()
         # the networks, which predict little for keyframes, leave their core to optical flow
         self._cores.enter_context(opencv_threads(usable_cores()))
-        self._odometry: KeyframeOdometry | None = KeyframeOdometry(intrinsics, seed, on_keyframe, loops.enabled)
+        self._odometry: KeyframeOdometry | None = KeyframeOdometry(
+            intrinsics, seed, on_keyframe, loops.enabled
+        )
         self.choose(Drive())
 
     @property
@@ -131,20 +140,28 @@ class KeyframeTracking:
         if self._measuring is None:
             return False
         is_usable = {index - 1, index}.isdisjoint(list(drive.unusable)[-LAST_STEPS:])
-        return is_usable and drive.last_step(index) is None and self._measuring.locates(index - 1, index)
+        return (
+            is_usable
+            and drive.last_step(index) is None
+            and self._measuring.locates(index - 1, index)
+        )
 
     def step(self, index: int) -> tuple[int, FloatArray] | None:
         """The last located frame before this one, and ``T_before_frame`` unscaled; None where it has no pose."""
         if self._measuring is None or not self._measuring.segments:
             return None
         segment = self._measuring.segments[-1]
-        placed = [(f.index, f.T_camera_world) for f in segment.frames[-_FRAMES:] if f.index <= index]
+        placed = [
+            (f.index, f.T_camera_world) for f in segment.frames[-_FRAMES:] if f.index <= index
+        ]
         located = [(place, T_map) for place, T_map in placed if T_map is not None]
         if len(located) < 2 or located[-1][0] != index:
             return None
         (before, T_before_map), (_, T_frame_map) = located[-2:]
         T_before_frame = T_before_map @ invert(T_frame_map)
-        T_before_frame[:3, 3] *= learned_unit(LocalMap(segment.keyframes[-_KEYFRAMES:], segment.points))
+        T_before_frame[:3, 3] *= learned_unit(
+            LocalMap(segment.keyframes[-_KEYFRAMES:], segment.points)
+        )
         return before, T_before_frame
 
     def maps(self, drive: Drive) -> list[LocalMap]:
@@ -161,7 +178,9 @@ def _is_on_vehicle(drive: Drive) -> bool | None:
 
     None while they are few. Without a road nothing has the speed of a vehicle; a vehicle that starts is slow.
     """
-    first = list(islice((motion for motion in drive.motions if motion.is_triangulated), _MOST_STEPS))
+    first = list(
+        islice((motion for motion in drive.motions if motion.is_triangulated), _MOST_STEPS)
+    )
     if len(first) < _CLEAR_STEPS:
         return None
     heights = [road for road in drive.roads if not isinstance(road, Failed)]
@@ -192,27 +211,39 @@ class MapClosure:
     def closures(self, scale: Scale) -> LoopClosures:
         """The loops in the unit of the scale, the accepted ones by the relative poses of the closed maps."""
         scaled = scaled_poses(self.poses.loops, self.poses, scale)
-        accepted = [replace(loop, measured=pose) for pose, loop in zip(scaled, self.loops.accepted, strict=True)]
+        accepted = [
+            replace(loop, measured=pose)
+            for pose, loop in zip(scaled, self.loops.accepted, strict=True)
+        ]
         return replace(self.loops, accepted=tuple(accepted))
 
 
-def close_maps(maps: Sequence[LocalMap], poses: KeyframePoses, intrinsics: Intrinsics, seed: int = 0) -> MapClosure:
+def close_maps(
+    maps: Sequence[LocalMap], poses: KeyframePoses, intrinsics: Intrinsics, seed: int = 0
+) -> MapClosure:
     """Find loops among all keyframes, join maps that share a place, adjust all keyframes of maps with loops.
 
     The ``maps`` of one drive, in time order, stay as they are, and so do their ``poses`` where no loop is found.
     """
     rows = _Rows(maps, poses)
     apart = rows.apart()
-    closures = find_loops(rows.views(), rows.track, apart.__getitem__, LoopVerifier(OF_KEYFRAMES, intrinsics, seed))
+    closures = find_loops(
+        rows.views(), rows.track, apart.__getitem__, LoopVerifier(OF_KEYFRAMES, intrinsics, seed)
+    )
     while closures.accepted:
         loops = closures.accepted
         closed, wrong = _closed(rows, loops, intrinsics)
         if not wrong:
             poses = keyframe_poses(closed, intrinsics, seed, [loop.ends for loop in loops])
             break
-        refused = [loop.refused("its corners are not the same points after the adjustment") for loop in wrong]
+        refused = [
+            loop.refused("its corners are not the same points after the adjustment")
+            for loop in wrong
+        ]
         rejected = most_inliers_first([*closures.rejected, *refused])
-        closures = replace(closures, accepted=tuple(loop for loop in loops if loop not in wrong), rejected=rejected)
+        closures = replace(
+            closures, accepted=tuple(loop for loop in loops if loop not in wrong), rejected=rejected
+        )
     joins = rows.joins(closures.accepted)
     for joined in joins:
         logger.info("%s", joined)
@@ -224,7 +255,9 @@ class _Rows:
 
     def __init__(self, maps: Sequence[LocalMap], poses: KeyframePoses) -> None:
         self.segments = maps
-        self.keyframes: list[TrackedKeyframe] = [keyframe for segment in maps for keyframe in segment.keyframes]
+        self.keyframes: list[TrackedKeyframe] = [
+            keyframe for segment in maps for keyframe in segment.keyframes
+        ]
         counts = [len(segment.keyframes) for segment in maps]
         self.maps: NDArray[np.intp] = np.repeat(np.arange(len(maps)), counts)
         self.T_map_camera = np.concatenate([segment.T_world_camera for segment in maps])
@@ -234,7 +267,9 @@ class _Rows:
         worlds = np.array([poses.component.get(frame, world) for frame, world in alone], np.intp)
         related = worlds >= 0
         T = self.T_map_camera.copy()
-        T[related] = np.array([poses.T_map_camera[k] for k in frames[related].tolist()]).reshape(-1, 4, 4)
+        T[related] = np.array([poses.T_map_camera[k] for k in frames[related].tolist()]).reshape(
+            -1, 4, 4
+        )
         path = path_distance(T)
         for pose in poses.poses:
             if poses.segments[pose.from_index] != poses.segments.get(pose.to_index):
@@ -258,7 +293,9 @@ class _Rows:
     def apart(self) -> NDArray[np.bool_]:
         """Which keyframes share few tracks ``(K, K)``."""
         first = np.cumsum([0, *(len(segment.points) for segment in self.segments)])
-        tracks = [k.track_ids + first[number] for k, number in zip(self.keyframes, self.maps, strict=True)]
+        tracks = [
+            k.track_ids + first[number] for k, number in zip(self.keyframes, self.maps, strict=True)
+        ]
         of_row = np.repeat(np.arange(len(tracks)), [len(of_keyframe) for of_keyframe in tracks])
         shape = len(tracks), int(first[-1])
         seen = csr_array((np.ones(len(of_row)), (of_row, np.concatenate(tracks))), shape=shape)
@@ -268,21 +305,35 @@ class _Rows:
         """Each map after the first that loops join with an earlier one."""
         events = []
         for number, segment in enumerate(self.segments):
-            rows = [(earlier, later) for earlier, later in map(self.of, loops) if self.maps[earlier] != number]
-            joining = [self.keyframes[earlier].index for earlier, later in rows if self.maps[later] == number]
+            rows = [
+                (earlier, later)
+                for earlier, later in map(self.of, loops)
+                if self.maps[earlier] != number
+            ]
+            joining = [
+                self.keyframes[earlier].index
+                for earlier, later in rows
+                if self.maps[later] == number
+            ]
             if joining:
                 first = segment.keyframes[0].index
                 events.append(TrackingEvent(first, "map joined", joining[0], len(joining)))
         return tuple(events)
 
-    def start(self, loops: Sequence[Loop], members: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+    def start(
+        self, loops: Sequence[Loop], members: NDArray[np.intp]
+    ) -> tuple[FloatArray, FloatArray]:
         """Poses ``(K, 4, 4)`` and units ``(K,)`` of all keyframes in the world of the first of some joined maps."""
         T, scales = self.T_map_camera.copy(), np.ones(len(self.keyframes))
         done = {int(members[0])}
         across = [loop for loop in loops if len(set(self.maps[list(self.of(loop))])) == 2]
         across.sort(key=lambda loop: -loop.inliers)
         while len(done) < len(members):
-            loop = next(loop for loop in across if len(done & set(self.maps[list(self.of(loop))].tolist())) == 1)
+            loop = next(
+                loop
+                for loop in across
+                if len(done & set(self.maps[list(self.of(loop))].tolist())) == 1
+            )
             known, new = self.of(loop)
             T_known_new, scale = loop.measured.T_from_to, loop.scale
             if int(self.maps[known]) not in done:
@@ -299,7 +350,9 @@ class _Rows:
         return T, scales
 
 
-def _closed(rows: _Rows, loops: Sequence[Loop], intrinsics: Intrinsics) -> tuple[list[LocalMap], list[Loop]]:
+def _closed(
+    rows: _Rows, loops: Sequence[Loop], intrinsics: Intrinsics
+) -> tuple[list[LocalMap], list[Loop]]:
     """The maps after these loops, and the loops that the adjustment contradicts."""
     count, ends = len(rows.segments), rows.maps[rows.track.rows(loops)]
     links = csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
@@ -307,7 +360,9 @@ def _closed(rows: _Rows, loops: Sequence[Loop], intrinsics: Intrinsics) -> tuple
     closed, wrong = [], []
     for number in np.unique(group):
         members = np.flatnonzero(group == number)
-        inside = [loop for loop, (earlier, _) in zip(loops, ends, strict=True) if group[earlier] == number]
+        inside = [
+            loop for loop, (earlier, _) in zip(loops, ends, strict=True) if group[earlier] == number
+        ]
         if not inside:
             closed += [rows.segments[member] for member in members]
             continue
@@ -325,16 +380,22 @@ def _joined(
     place = np.full(len(rows.keyframes), -1)
     place[chosen] = np.arange(len(chosen))
     edges, shared = [], []
-    for first, row in enumerate(chosen):  # between neighbouring keyframes of one map, whose unit hardly changes
+    for first, row in enumerate(
+        chosen
+    ):  # between neighbouring keyframes of one map, whose unit hardly changes
         for last in range(first + 1, min(first + 1 + _NEIGHBOURS, len(chosen))):
             if rows.maps[row] == rows.maps[chosen[last]]:
                 T_step = invert(rows.T_map_camera[row]) @ rows.T_map_camera[chosen[last]]
                 length = _RELATIVE_SIGMA * float(np.linalg.norm(T_step[:3, 3])) + _LEAST_SIGMA
-                sigmas = np.concatenate([np.full(3, _ROTATION_SIGMA), np.full(3, length), [_SCALE_SIGMA]])
+                sigmas = np.concatenate(
+                    [np.full(3, _ROTATION_SIGMA), np.full(3, length), [_SCALE_SIGMA]]
+                )
                 edges.append(RelativeSimilarity(first, last, T_step, 1.0, sigmas))
     for loop, (earlier, later) in zip(loops, place[rows.track.rows(loops)].tolist(), strict=True):
         sigmas = np.append(loop.measured.sigmas, _LOOP_SCALE_SIGMA)
-        edges.append(RelativeSimilarity(earlier, later, loop.measured.T_from_to, loop.scale, sigmas))
+        edges.append(
+            RelativeSimilarity(earlier, later, loop.measured.T_from_to, loop.scale, sigmas)
+        )
         shared.append((earlier, later, loop.corners))
     T, scales = optimise_similarities(T[chosen], scales[chosen], edges)
     return join([rows.segments[member] for member in members], T, scales, shared, intrinsics)

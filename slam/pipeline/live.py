@@ -95,7 +95,13 @@ class LivePoses:
         unit = None if self.unit_name is None else self._unit
         support = frame_support(frames, drive.motions[-LAST_STEPS * len(frames) :]).tolist()
         return [
-            LivePose(k, pose.copy(), self._state(k in drive.unusable), unit, None if k in unasked else share)
+            LivePose(
+                k,
+                pose.copy(),
+                self._state(k in drive.unusable),
+                unit,
+                None if k in unasked else share,
+            )
             for k, pose, share in zip(frames, self._T_world_camera[first:], support)
         ]
 
@@ -116,7 +122,11 @@ class LivePoses:
         if not index:
             self._T_world_camera.append(np.eye(4))
             return False
-        before, by_keyframes, motion = index - 1, observer.keyframes.step(index), observer.drive.last_step(index)
+        before, by_keyframes, motion = (
+            index - 1,
+            observer.keyframes.step(index),
+            observer.drive.last_step(index),
+        )
         T_before_frame = None
         if by_keyframes is not None:
             before, T_before_frame = by_keyframes
@@ -126,7 +136,9 @@ class LivePoses:
         if T_before_frame is not None:
             T_before_frame[:3, 3] *= self.unit
         else:  # the camera goes on as it went
-            T_before_frame = invert(self._T_world_camera[max(before - 1, 0)]) @ self._T_world_camera[before]
+            T_before_frame = (
+                invert(self._T_world_camera[max(before - 1, 0)]) @ self._T_world_camera[before]
+            )
         self._T_world_camera.append(compose(self._T_world_camera[before], T_before_frame))
         return by_keyframes is not None
 
@@ -215,7 +227,9 @@ class Slam:
             ErfsfmError: as ``DepthPosePredictor.from_weights``.
         """
         _require_possible(intrinsics, camera_height_m)
-        prediction = open_prediction(name_or_dir, device, (config or SlamConfig()).depth, intrinsics)
+        prediction = open_prediction(
+            name_or_dir, device, (config or SlamConfig()).depth, intrinsics
+        )
         return cls(prediction.predictor, intrinsics, config, camera_height_m, with_map=with_map)
 
     def __len__(self) -> int:
@@ -258,12 +272,19 @@ class Slam:
         """
         if self._is_closed:
             raise SlamError("this session is closed: make another Slam")
-        size, shape = (self._sequence.intrinsics.height, self._sequence.intrinsics.width, 3), np.shape(image)
+        size, shape = (
+            (self._sequence.intrinsics.height, self._sequence.intrinsics.width, 3),
+            np.shape(image),
+        )
         if shape != size or image.dtype != np.uint8:
-            raise ValueError(f"image must be {size} uint8; got {shape} {getattr(image, 'dtype', type(image).__name__)}")
+            raise ValueError(
+                f"image must be {size} uint8; got {shape} {getattr(image, 'dtype', type(image).__name__)}"
+            )
         since = stamp - self._sequence.stamps[-1] if len(self) else POSSIBLE_PERIODS_S[1]
         if not (np.isfinite(stamp) and 0 < since <= POSSIBLE_PERIODS_S[1]):
-            raise ValueError(f"stamps must increase, in seconds; got {stamp} after {self._sequence.stamps[-1:]}")
+            raise ValueError(
+                f"stamps must increase, in seconds; got {stamp} after {self._sequence.stamps[-1:]}"
+            )
         image = image.copy()  # used again with the next one
         image.setflags(write=False)
         index = len(self)
@@ -370,4 +391,6 @@ def _require_possible(intrinsics: Intrinsics, camera_height_m: float | None) -> 
     if (problem := impossible(intrinsics)) is not None:
         raise SlamError(f"intrinsics: {problem}")
     if camera_height_m is not None and not 0 < camera_height_m <= HIGHEST_M:
-        raise SlamError(f"camera_height_m must be metres above the road, to {HIGHEST_M:g}; got {camera_height_m!r}")
+        raise SlamError(
+            f"camera_height_m must be metres above the road, to {HIGHEST_M:g}; got {camera_height_m!r}"
+        )

@@ -14,7 +14,16 @@ import numpy as np
 
 from erfsfm.common.errors import OneLineError, explained, shows_traceback
 from slam.config.sections import SlamConfig
-from slam.frames import DepthMap, Ends, Frame, Intrinsics, Mask, Predictor, SnippetPoses, resized_mask
+from slam.frames import (
+    DepthMap,
+    Ends,
+    Frame,
+    Intrinsics,
+    Mask,
+    Predictor,
+    SnippetPoses,
+    resized_mask,
+)
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.image_gate import ImageGate, Verdict
 from slam.frontend.road import GroundPlaneFitter, RoadHomography, RoadStep
@@ -33,7 +42,9 @@ _NO_POSE = "its pose is no finite rigid transform and leaves a gap"
 _MOVED_ON_HEIGHTS = 1.5  # way of the camera after which depth is predicted again, camera heights
 _LAST_ROADS = 8  # looked back for the camera's height, frames
 _MOST_UNREAD = 30  # unreadable images in a row: three seconds at 10 Hz, beyond which the motion cannot be guessed
-_LOOP_STRIDE = 4  # frames between views for loops: a car goes some 4 m, still the same place to a descriptor
+_LOOP_STRIDE = (
+    4  # frames between views for loops: a car goes some 4 m, still the same place to a descriptor
+)
 
 
 @dataclass
@@ -124,7 +135,9 @@ class Observer:
         if index % 200 == 0:  # 24 MB
             return_freed_memory()
         if isinstance(frame, SequenceError):
-            is_missing = isinstance(frame, MissingFrameError) and self._config.gaps.enabled  # never ends a run
+            is_missing = (
+                isinstance(frame, MissingFrameError) and self._config.gaps.enabled
+            )  # never ends a run
             self._unread += not is_missing
             if not (is_missing or self._is_gap(self._unread)):
                 raise frame
@@ -156,7 +169,10 @@ class Observer:
         """All measurements so far, which stay while more frames follow."""
         self.flush()
         drive = self.drive.copy()
-        drive.depth_error, drive.focal_length = self._odometry.depth_error, self._odometry.focal_length
+        drive.depth_error, drive.focal_length = (
+            self._odometry.depth_error,
+            self._odometry.focal_length,
+        )
         drive.maps = self.keyframes.maps(drive)
         drive.events = list(self.keyframes.events)
         return drive
@@ -189,18 +205,26 @@ class Observer:
         has_moved = False  # whether as many more steps as this one leave what the last predicted depth shows
         if step is not None:
             roads = drive.roads[: step.ends[1] + 1][-_LAST_ROADS:]
-            height = next((road for road in reversed(roads) if not isinstance(road, Failed)), math.inf)
+            height = next(
+                (road for road in reversed(roads) if not isinstance(road, Failed)), math.inf
+            )
             way = (index + 1 - self._depth_index) * step.length_unscaled
             has_moved = way > _MOVED_ON_HEIGHTS * height
         after_frozen = drive.repeated[-1:] == [index - 1]  # what it hid is not carried
-        wants_depth = not by_keyframes and (step is None or has_moved or index % stride == 0 or after_frozen)
+        wants_depth = not by_keyframes and (
+            step is None or has_moved or index % stride == 0 or after_frozen
+        )
         is_dense = not by_keyframes and (step is None or stride == 1)
-        wants_snippet = len(self._snippet_frames) > sources and (is_first or is_dense or index % sources == 0)
+        wants_snippet = len(self._snippet_frames) > sources and (
+            is_first or is_dense or index % sources == 0
+        )
         asked = FrameInWork(frame, None, None, self.gate.standing)
         if wants_depth:
             self._depth_index, asked.prediction = index, self._predict(frame)
         if wants_snippet:
-            asked.snippet = self._networks.submit(self._predictor.snippet, list(self._snippet_frames))
+            asked.snippet = self._networks.submit(
+                self._predictor.snippet, list(self._snippet_frames)
+            )
         return asked
 
     def _predict(self, frame: Frame) -> Future[DepthMap]:
@@ -273,10 +297,14 @@ class Observer:
         if step is not None and previous is not None:
             T_previous_current = step.relative_pose.T_from_to
             images = previous.frame, current.frame
-            measured = self._beside.submit(self._road.measure, *images, T_previous_current, current.standing)
+            measured = self._beside.submit(
+                self._road.measure, *images, T_previous_current, current.standing
+            )
             self._tasks.append(Task("road", measured, partial(self._keep_road, step.ends)))
         if current.prediction is not None:
-            self._tasks.append(Task("depth network", current.prediction, partial(self._learn, current)))
+            self._tasks.append(
+                Task("depth network", current.prediction, partial(self._learn, current))
+            )
         if was_asked:  # that of a keyframe comes while it is adjusted
             self._finish_tasks("depth network")
 
@@ -284,7 +312,9 @@ class Observer:
         """Everything that the depth ``(H, W)`` of a frame gives."""
         frame, error = current.frame, self._odometry.depth_error
         if current.standing is not None:
-            depth = np.where(resized_mask(current.standing, *depth.shape[::-1]), np.float32(0), depth)
+            depth = np.where(
+                resized_mask(current.standing, *depth.shape[::-1]), np.float32(0), depth
+            )
         with self._stopwatch.stage("road"):
             self.drive.roads[frame.index] = road = self._plane.fit(depth, error)
         self.keyframes.learn(frame, depth)
@@ -302,7 +332,9 @@ class Observer:
         if recent.depth is not None:
             return recent.depth
         step = self.drive.last_step(recent.frame.index)
-        before = next((r for r in self._recent if step is not None and r.frame.index == step.ends[0]), None)
+        before = next(
+            (r for r in self._recent if step is not None and r.frame.index == step.ends[0]), None
+        )
         if step is not None and before is not None and before.depth is not None:
             recent.depth, recent.height = self._odometry.carried(before.depth, step), before.height
         if recent.depth is not None:
@@ -315,16 +347,25 @@ class Observer:
 
     def _step(self, previous: FrameInWork | None, current: FrameInWork) -> Motion | None:
         """The motion from the frame before; None where keyframes measure it, it failed or triangulated no point."""
-        wanted = self._config.visual_odometry.enabled and not self.keyframes.measures(self.drive, current.frame.index)
+        wanted = self._config.visual_odometry.enabled and not self.keyframes.measures(
+            self.drive, current.frame.index
+        )
         if previous is None or not wanted:
             return None
         depth = self._depth_of(previous)
-        measured = self._odometry.measure(previous.frame, current.frame, depth, previous.height, current.standing)
+        measured = self._odometry.measure(
+            previous.frame, current.frame, depth, previous.height, current.standing
+        )
         if isinstance(measured, Motion) and not is_se3(measured.relative_pose.T_from_to):
             measured = Failed(_NO_POSE)
         if isinstance(measured, Failed):
             self.drive.failures.append((previous.frame.index, current.frame.index, measured.reason))
-            logger.info("geometry %d -> %d failed: %s", previous.frame.index, current.frame.index, measured.reason)
+            logger.info(
+                "geometry %d -> %d failed: %s",
+                previous.frame.index,
+                current.frame.index,
+                measured.reason,
+            )
             return None
         self.drive.motions.append(measured)
         return measured if measured.is_triangulated else None
@@ -334,12 +375,18 @@ class Observer:
         if len(self._recent) < ROTATION_BASELINE:
             return None
         first = self._recent[-ROTATION_BASELINE]
-        motions = {m.ends: m for m in self.drive.motions[-2 * ROTATION_BASELINE :] if m.is_triangulated}
+        motions = {
+            m.ends: m for m in self.drive.motions[-2 * ROTATION_BASELINE :] if m.is_triangulated
+        }
         path = path_between(shortest_by_start(motions), first.frame.index, current.index)
         if path is None or len(path) != ROTATION_BASELINE:
             return None
-        T_first_current = chain(np.array([motions[ends].relative_pose.T_from_to for ends in path]))[-1]
-        return self._odometry.relative_rotation(first.frame, current, self._depth_of(first), T_first_current)
+        T_first_current = chain(np.array([motions[ends].relative_pose.T_from_to for ends in path]))[
+            -1
+        ]
+        return self._odometry.relative_rotation(
+            first.frame, current, self._depth_of(first), T_first_current
+        )
 
     def _keep_road(self, ends: Ends, step: RoadStep | Failed) -> None:
         if isinstance(step, RoadStep):
@@ -362,7 +409,9 @@ class Observer:
     def _finish_tasks(self, stage: str | None = None) -> None:
         """Wait for the tasks of the last frame, or for those of one stage alone."""
         tasks = [task for task in self._tasks if stage in (None, task.stage)]
-        self._tasks = [task for task in self._tasks if task not in tasks]  # so that a failed one is not raised again
+        self._tasks = [
+            task for task in self._tasks if task not in tasks
+        ]  # so that a failed one is not raised again
         for task in tasks:
             with self._stopwatch.stage(task.stage):
                 result = task.result.result()

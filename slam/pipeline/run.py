@@ -153,12 +153,25 @@ class SlamPipeline:
         recorder.trajectory("odometry", self._trajectory(odometry.T_world_camera))
         with self._watch.stage("loops"):
             closed = attempt("loop closure", lambda: self._closed(odometry, observed))
-        odometry, loops = (odometry, LoopClosures(not_sought=closed.reason)) if isinstance(closed, Failed) else closed
+        odometry, loops = (
+            (odometry, LoopClosures(not_sought=closed.reason))
+            if isinstance(closed, Failed)
+            else closed
+        )
         fixes = self._fixes
-        location = None if fixes is None else fixes.locate(odometry.T_world_camera, odometry.scale.estimate)
+        location = (
+            None
+            if fixes is None
+            else fixes.locate(odometry.T_world_camera, odometry.scale.estimate)
+        )
         solved = attempt("the pose graph", lambda: self._optimised(odometry, loops, location))
         if isinstance(solved, Failed):
-            solved = solved, odometry.T_world_camera, LoopClosures(not_sought=solved.reason), location
+            solved = (
+                solved,
+                odometry.T_world_camera,
+                LoopClosures(not_sought=solved.reason),
+                location,
+            )
         graph, T_optimised, loops, location = solved
         agreements, confidence = self._confidence(odometry)
         return Estimate(
@@ -196,7 +209,9 @@ class SlamPipeline:
         shortest = self._predictor.sources + 1
         require_possible(self.sequence, self._config, shortest, self._gps_track is not None)
         if self._gps_track is not None:
-            self._fixes = GpsFixes(self._gps_track, self.sequence.stamps, self._config.gps, self.mode)
+            self._fixes = GpsFixes(
+                self._gps_track, self.sequence.stamps, self._config.gps, self.mode
+            )
         _ = self._decide
 
     def _observe(self, recorder: Recorder, frames: Iterator[Frame] | None) -> Drive:
@@ -220,25 +235,44 @@ class SlamPipeline:
         if seen == total:
             return
         if seen <= self._predictor.sources:
-            raise SlamError(f"interrupted after {seen} frames, before the first snippet of the networks")
+            raise SlamError(
+                f"interrupted after {seen} frames, before the first snippet of the networks"
+            )
         logger.warning("interrupted: the run is of the first %d of %d frames", seen, total)
         assert isinstance(self.sequence, RecordedSequence)  # a live drive is what was seen
         self.sequence = self.sequence.cut(0, seen)
         self.require_possible()
 
     def _odometry(
-        self, drive: Drive, scale: Scale, lidar_steps: Sequence[RelativePose], agreements: Sequence[Agreement]
+        self,
+        drive: Drive,
+        scale: Scale,
+        lidar_steps: Sequence[RelativePose],
+        agreements: Sequence[Agreement],
     ) -> Odometry:
         """Factors of a drive and the odometry chained from them, in the final unit, which the mode may find first."""
         if self.mode in ("reference", "known", "gps"):
             unit = self._unit(chain_odometry(make_factors(drive, scale), len(drive)))
-            if isinstance(unit, ScaleEstimate) and isinstance(scale.estimate, ScaleEstimate) and not scale.is_metric:
-                name, height, spread = f"scale.mode={self.mode}", self.sequence.camera_height_m, scale.estimate.spread
-                agreements = [*agreements, agreement.of_height(name, unit.value, height, spread).required()]
+            if (
+                isinstance(unit, ScaleEstimate)
+                and isinstance(scale.estimate, ScaleEstimate)
+                and not scale.is_metric
+            ):
+                name, height, spread = (
+                    f"scale.mode={self.mode}",
+                    self.sequence.camera_height_m,
+                    scale.estimate.spread,
+                )
+                agreements = [
+                    *agreements,
+                    agreement.of_height(name, unit.value, height, spread).required(),
+                ]
             scale = scale.in_metres(unit)
         as_factors = lidar_steps if self._config.lidar.factors and scale.is_metric else ()
         factors = make_factors(drive, scale, as_factors)
-        return Odometry(drive, scale, factors, chain_odometry(factors, len(drive)), lidar_steps, agreements)
+        return Odometry(
+            drive, scale, factors, chain_odometry(factors, len(drive)), lidar_steps, agreements
+        )
 
     def _unit(self, T_odometry: FloatArray) -> ScaleEstimate | Failed:
         """Metres per unit of an odometry, by what the mode knows of the drive."""
@@ -254,11 +288,15 @@ class SlamPipeline:
         camera, config, seed = self.sequence.intrinsics, self._config.loops, self._seed
         if not (observed.maps and config.enabled):
             views, is_metric = odometry.views(), odometry.scale.is_metric
-            return odometry, close_loops(views, odometry.T_world_camera, camera, config, is_metric, seed)
+            return odometry, close_loops(
+                views, odometry.T_world_camera, camera, config, is_metric, seed
+            )
         closure = close_maps(observed.maps, odometry.drive.map_poses, camera, seed)
         if closure.loops.accepted:
             drive = complete_drive(observed, self._predictor.sources, closure.poses, closure.joins)
-            odometry = self._odometry(drive, odometry.scale, odometry.lidar_steps, odometry.agreements)
+            odometry = self._odometry(
+                drive, odometry.scale, odometry.lidar_steps, odometry.agreements
+            )
         return odometry, closure.closures(odometry.scale)
 
     def _optimised(
@@ -296,11 +334,18 @@ class SlamPipeline:
         steps = usable_steps(lidar, are_needed=self.mode == "lidar")
         by_lidar = [agreement.of_steps(LIDAR_SOURCE, steps, triangulated(drive.steps))]
         if (height := height_by_lidar(steps, drive)) is not None:
-            by_lidar.append(agreement.of_height(LIDAR_SOURCE, height, self.sequence.camera_height_m, 0.0))
+            by_lidar.append(
+                agreement.of_height(LIDAR_SOURCE, height, self.sequence.camera_height_m, 0.0)
+            )
         worst = max(filter(None, by_lidar), key=lambda each: each.sigmas, default=None)
-        compared = [] if worst is None else [worst.required() if self.mode == "lidar" else worst.said()]
+        compared = (
+            [] if worst is None else [worst.required() if self.mode == "lidar" else worst.said()]
+        )
         source = self._config.depth.source
-        if source != "network" and (by_depth := agreement.of_depth(source, drive.depth_error)) is not None:
+        if (
+            source != "network"
+            and (by_depth := agreement.of_depth(source, drive.depth_error)) is not None
+        ):
             compared.append(by_depth.required())
         return [] if worst is not None and worst.is_wrong else steps, compared
 
@@ -308,9 +353,13 @@ class SlamPipeline:
         """Agreements of all sources and of the images, and what follows from them."""
         drive, scale, by_sources = odometry.drive, odometry.scale, list(odometry.agreements)
         if self._fixes is not None and (by_gps := self._fixes.agreement) is not None:
-            by_sources.append(by_gps if by_gps.is_wrong else by_gps.said())  # why it is not used was said
+            by_sources.append(
+                by_gps if by_gps.is_wrong else by_gps.said()
+            )  # why it is not used was said
         needs_road = scale.unit in ("metres", "camera heights")
-        of_images = agreement.of_images(drive, self.sequence.intrinsics, scale.contradicted, needs_road)
+        of_images = agreement.of_images(
+            drive, self.sequence.intrinsics, scale.contradicted, needs_road
+        )
         if not drive.maps:
             of_images.append(agreement.of_directions(odometry.T_world_camera))
         trusted = [*(each for each in by_sources if not each.is_wrong), *of_images]

@@ -11,7 +11,14 @@ from typing import Any
 from erfsfm.inference import DepthPosePredictor, depth_at, limit_torch_threads
 from slam.config.sections import DEPTH_PLUG_INS, DepthConfig
 from slam.frames import DepthMap, Frame, Intrinsics, Predictor, SnippetPoses
-from slam.prediction.depth_source import DepthFolder, DepthSource, FrameNumbers, OnnxDepth, SourcedPredictor, Undistort
+from slam.prediction.depth_source import (
+    DepthFolder,
+    DepthSource,
+    FrameNumbers,
+    OnnxDepth,
+    SourcedPredictor,
+    Undistort,
+)
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_plug_in, plug_ins
 
@@ -26,7 +33,9 @@ class NetworkPredictor:
 
     def executor(self) -> Executor:
         """One thread, in which torch leaves a core to the other threads."""
-        return ThreadPoolExecutor(max_workers=1, thread_name_prefix="networks", initializer=limit_torch_threads)
+        return ThreadPoolExecutor(
+            max_workers=1, thread_name_prefix="networks", initializer=limit_torch_threads
+        )
 
     def depth(self, frame: Frame) -> DepthMap:
         """Unscaled z-depth ``(H, W)`` at the image's size."""
@@ -38,7 +47,9 @@ class NetworkPredictor:
 
     def snippet(self, frames: Sequence[Frame]) -> SnippetPoses:
         """Poses of the sources of a snippet; the target is the middle frame."""
-        T_source_target = self._networks.poses([self._prepared(frame) for frame in frames], self._intrinsics)
+        T_source_target = self._networks.poses(
+            [self._prepared(frame) for frame in frames], self._intrinsics
+        )
         middle = self.sources // 2
         sources = tuple(f.index for k, f in enumerate(frames) if k != middle)
         return SnippetPoses(frames[middle].index, sources, T_source_target)
@@ -48,7 +59,10 @@ class NetworkPredictor:
 
 
 def open_depth(
-    config: DepthConfig, intrinsics: Intrinsics, numbers: FrameNumbers | None, undistort: Undistort | None = None
+    config: DepthConfig,
+    intrinsics: Intrinsics,
+    numbers: FrameNumbers | None,
+    undistort: Undistort | None = None,
 ) -> DepthSource | None:
     """Open and check the source of depth; None where depth is that of the networks.
 
@@ -103,4 +117,6 @@ def open_prediction(
     source = open_depth(depth, intrinsics, numbers, undistort)
     networks = DepthPosePredictor.from_weights(weights, device, "onnx")
     own = NetworkPredictor(networks, intrinsics)
-    return Prediction(networks, source, own if source is None else SourcedPredictor(own, source, depth.align))
+    return Prediction(
+        networks, source, own if source is None else SourcedPredictor(own, source, depth.align)
+    )

@@ -46,7 +46,9 @@ _LEAST_COMPARED = 50
 _REWEIGHTINGS = 8
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_HEADER_BYTES = 26
-Undistort = Callable[[DepthMap], DepthMap]  # z-depth (H, W) of a stored image to that of the undistorted one
+Undistort = Callable[
+    [DepthMap], DepthMap
+]  # z-depth (H, W) of a stored image to that of the undistorted one
 _MOST_BYTES = 2**31  # of a message of Protocol Buffers
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 _OWN_INPUT = "RGB in [-1, 1]"  # as `erfsfm export` writes it into the metadata
@@ -106,7 +108,9 @@ class SourcedPredictor:
         snippet = self._networks.snippet(list(frames))
         if self._align != "none":
             return snippet
-        by_distance = sorted(frames, key=lambda frame: (abs(frame.index - snippet.target), -frame.index))
+        by_distance = sorted(
+            frames, key=lambda frame: (abs(frame.index - snippet.target), -frame.index)
+        )
         units = (self._aligned(frame)[1] for frame in by_distance)
         unit = next((unit for unit in units if not np.isnan(unit)), None)
         if unit is None:
@@ -127,7 +131,10 @@ class SourcedPredictor:
         disparity = self._source.disparity(frame)
         disparity = at_size(disparity, height, width)
         step = max(int(np.sqrt(height * width / _COMPARED)), 1)
-        own, wanted = (map_[::step, ::step].astype(np.float64) for map_ in (disparity, 1 / self._networks.depth(frame)))
+        own, wanted = (
+            map_[::step, ::step].astype(np.float64)
+            for map_ in (disparity, 1 / self._networks.depth(frame))
+        )
         known = np.isfinite(own)
         own, wanted = own[known], wanted[known]
         if len(own) < _LEAST_COMPARED:
@@ -162,17 +169,23 @@ def at_size(disparity: Disparity, height: int, width: int) -> Disparity:
         return disparity
     known = np.isfinite(disparity)
     if known.all():
-        return np.asarray(cv2.resize(disparity, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+        return np.asarray(
+            cv2.resize(disparity, (width, height), interpolation=cv2.INTER_LINEAR), np.float32
+        )
     shrinks = disparity.shape[0] >= height and disparity.shape[1] >= width
     method, least = (cv2.INTER_AREA, 1e-3) if shrinks else (cv2.INTER_LINEAR, 0.5)
     weight, total = (
         cv2.resize(part.astype(np.float32), (width, height), interpolation=method)
         for part in (known, np.where(known, disparity, 0))
     )
-    return np.where(weight >= least, total / np.maximum(weight, least), np.float32(np.nan)).astype(np.float32)
+    return np.where(weight >= least, total / np.maximum(weight, least), np.float32(np.nan)).astype(
+        np.float32
+    )
 
 
-def _affine(own: NDArray[np.float64], wanted: NDArray[np.float64], gain: float) -> tuple[np.float32, np.float32]:
+def _affine(
+    own: NDArray[np.float64], wanted: NDArray[np.float64], gain: float
+) -> tuple[np.float32, np.float32]:
     """Gain and shift from ``own`` to ``wanted`` disparity, by least squares with Cauchy weights.
 
     Where they would turn near into far, only a gain is fitted.
@@ -202,7 +215,12 @@ class DepthFolder:
     """Files of a folder in the order of their numbers, or names; each is checked before the first is used."""
 
     def __init__(
-        self, config: DepthConfig, numbers: FrameNumbers, width: int, height: int, undistort: Undistort | None = None
+        self,
+        config: DepthConfig,
+        numbers: FrameNumbers,
+        width: int,
+        height: int,
+        undistort: Undistort | None = None,
     ) -> None:
         """Check the files of the frames of a run.
 
@@ -223,7 +241,9 @@ class DepthFolder:
         self._read: Callable[[Path], NDArray[Any]] = _pixels if suffix == "png" else _array
         self._folder = Path(path).expanduser()
         self._paths = _paths_of_frames(self._folder, suffix, numbers)
-        self.sha256 = self._checked(_size_of_picture if suffix == "png" else lambda path: _array(path).shape)
+        self.sha256 = self._checked(
+            _size_of_picture if suffix == "png" else lambda path: _array(path).shape
+        )
 
     def disparity(self, frame: Frame) -> Disparity:
         """1/depth ``(h, w)`` of a frame, NaN where unknown.
@@ -233,7 +253,9 @@ class DepthFolder:
         """
         path = self._paths.get(frame.index)
         if path is None:
-            raise SlamError(f"{self._folder} has no depth for frame {frame.index}: its number is missing, add the file")
+            raise SlamError(
+                f"{self._folder} has no depth for frame {frame.index}: its number is missing, add the file"
+            )
         disparity = disparity_of(self._read(path) / self._scale, self._kind)
         if self._undistort is None:
             return disparity
@@ -248,11 +270,15 @@ class DepthFolder:
             try:
                 sizes[size_of(path)] = path
                 with path.open("rb") as file:
-                    digest.update(path.name.encode() + b"\0" + hashlib.file_digest(file, "sha256").digest())
+                    digest.update(
+                        path.name.encode() + b"\0" + hashlib.file_digest(file, "sha256").digest()
+                    )
             except OSError as error:
                 raise SlamError(f"cannot read depth {path}: {error.strerror or error}") from error
         if not sizes:
-            raise SlamError(f"{self._folder} has no depth for the frames of this run: check depth.source")
+            raise SlamError(
+                f"{self._folder} has no depth for the frames of this run: check depth.source"
+            )
         (height, width), *others = sizes
         if others:
             raise SlamError(
@@ -270,13 +296,23 @@ def _paths_of_frames(folder: Path, suffix: str, numbers: FrameNumbers) -> dict[i
     """The file of each frame of a run; the folder covers the whole recording or just the run."""
     if not folder.is_dir():
         raise SlamError(f"no depth folder {folder}: check depth.source={suffix}:FOLDER")
-    paths = [path for path in folder.iterdir() if path.suffix.lower() == f".{suffix}" and not path.name.startswith(".")]
+    paths = [
+        path
+        for path in folder.iterdir()
+        if path.suffix.lower() == f".{suffix}" and not path.name.startswith(".")
+    ]
     if not paths:
-        raise SlamError(f"{folder} holds no .{suffix} file: give the folder with one .{suffix} file a frame")
+        raise SlamError(
+            f"{folder} holds no .{suffix} file: give the folder with one .{suffix} file a frame"
+        )
     with sequence_errors():
         files = by_name(sorted(paths, key=natural_key))
     if len(files) not in (numbers.total, numbers.count):
-        selected = "" if numbers.count == numbers.total else f", or {numbers.count}, the frames of this run"
+        selected = (
+            ""
+            if numbers.count == numbers.total
+            else f", or {numbers.count}, the frames of this run"
+        )
         raise SlamError(
             f"{folder} has {len(files)} frames of .{suffix} (numbers that are missing between two are counted): give "
             f"one file a frame, {numbers.total} for the whole sequence{selected}"
@@ -294,8 +330,15 @@ def _array(path: Path) -> NDArray[Any]:
         raise SlamError(
             f"{path} holds Python objects, which are not loaded, or is damaged ({error}): write it with numpy.save"
         ) from error
-    if not isinstance(values, np.ndarray) or values.squeeze().ndim != 2 or not values.size or values.dtype.kind != "f":
-        raise SlamError(f"{path} must hold one array of floats of shape (H, W): write it with numpy.save")
+    if (
+        not isinstance(values, np.ndarray)
+        or values.squeeze().ndim != 2
+        or not values.size
+        or values.dtype.kind != "f"
+    ):
+        raise SlamError(
+            f"{path} must hold one array of floats of shape (H, W): write it with numpy.save"
+        )
     return values.squeeze()
 
 
@@ -313,7 +356,9 @@ def _size_of_picture(path: Path) -> tuple[int, int]:
         header = file.read(_PNG_HEADER_BYTES)
     bits_and_colour = header[24:26] if header.startswith(_PNG_SIGNATURE) else b""
     if bits_and_colour != b"\x10\x00":
-        raise SlamError(f"{path} is no 16-bit grey PNG, metres x 256 or as depth.png_scale: write depth so")
+        raise SlamError(
+            f"{path} is no 16-bit grey PNG, metres x 256 or as depth.png_scale: write depth so"
+        )
     return int.from_bytes(header[20:24]), int.from_bytes(header[16:20])
 
 
@@ -334,7 +379,9 @@ class OnnxDepth:
         try:
             content = read_bytes(self._path, _MOST_BYTES)
         except OSError as error:
-            raise SlamError(f"cannot read {self._path} ({error.strerror}): check depth.source=onnx:FILE") from error
+            raise SlamError(
+                f"cannot read {self._path} ({error.strerror}): check depth.source=onnx:FILE"
+            ) from error
         self.sha256 = hashlib.sha256(content).hexdigest()
         self._session, notes = self._opened(content)
         self._input, self._shape, self._height, self._width = self._image_input(config)
@@ -356,7 +403,9 @@ class OnnxDepth:
         resized = resize_image(image, self._height, self._width).astype(np.float32)
         values = resized / (255 * self._std) - self._mean / self._std  # (h, w, 3)
         tensor = values.transpose(2, 0, 1) if self._shape[-3] == 3 else values
-        tensor = np.ascontiguousarray(tensor[(None,) * (len(self._shape) - 3)], _TYPES[self._input.type])
+        tensor = np.ascontiguousarray(
+            tensor[(None,) * (len(self._shape) - 3)], _TYPES[self._input.type]
+        )
         try:
             (output,) = self._session.run([self._output], {self._input.name: tensor})
         except _errors() as error:
@@ -379,9 +428,13 @@ class OnnxDepth:
             if not model.graph.node:
                 raise DecodeError("no operators in it")
         except DecodeError as error:
-            raise SlamError(f"{self._path} is damaged or no ONNX file ({error}): copy or export it again") from error
+            raise SlamError(
+                f"{self._path} is damaged or no ONNX file ({error}): copy or export it again"
+            ) from error
         try:
-            convert_model_from_external_data(model)  # marks weights in other files as read, or finds that they are not
+            convert_model_from_external_data(
+                model
+            )  # marks weights in other files as read, or finds that they are not
         except ValueError as error:
             reason = "keeps weights in other files, which are not read: save it as one file"
             raise SlamError(f"{self._path} {reason}") from error
@@ -394,7 +447,9 @@ class OnnxDepth:
             ) from error
         return session, {entry.key: entry.value for entry in model.metadata_props}
 
-    def _settings(self, config: DepthConfig, own: bool) -> tuple[Kind, NDArray[np.float32], NDArray[np.float32]]:
+    def _settings(
+        self, config: DepthConfig, own: bool
+    ) -> tuple[Kind, NDArray[np.float32], NDArray[np.float32]]:
         """Kind of the output, mean and standard deviation of the input; those of our own exports are known."""
         missing = {
             "depth.kind=depth or disparity": config.kind == "auto",
@@ -431,7 +486,10 @@ class OnnxDepth:
             raise SlamError(
                 f"{self._path} takes images of any size: set depth.size=[HEIGHT,WIDTH], such as that of its training"
             )
-        if any(isinstance(fixed, int) and fixed != side for fixed, side in zip(sides, size, strict=True)):
+        if any(
+            isinstance(fixed, int) and fixed != side
+            for fixed, side in zip(sides, size, strict=True)
+        ):
             raise SlamError(
                 f"{self._path} takes images of height and width {sides}, not {list(size)}: leave depth.size out"
             )
@@ -442,14 +500,22 @@ class OnnxDepth:
         if config.output_name in names:
             return config.output_name
         if config.output_name or len(names) > 1:
-            wanted = f"no output {config.output_name}" if config.output_name else f"{len(names)} outputs"
-            raise SlamError(f"{self._path} has {wanted}: set depth.output_name to one of {', '.join(names)}")
+            wanted = (
+                f"no output {config.output_name}" if config.output_name else f"{len(names)} outputs"
+            )
+            raise SlamError(
+                f"{self._path} has {wanted}: set depth.output_name to one of {', '.join(names)}"
+            )
         return names[0]
 
 
 def _errors() -> tuple[type[Exception], ...]:
     """What ONNX Runtime raises: classes without a common base of their own."""
-    own = [kind for kind in vars(state).values() if isinstance(kind, type) and issubclass(kind, Exception)]
+    own = [
+        kind
+        for kind in vars(state).values()
+        if isinstance(kind, type) and issubclass(kind, Exception)
+    ]
     return (*own, RuntimeError, ValueError)
 
 

@@ -15,7 +15,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import chdtri, fdtri
 
-from erfsfm.evaluation.pose_metrics import SnippetErrors, snippet_errors, snippet_from_network, snippets_from_trajectory
+from erfsfm.evaluation.pose_metrics import (
+    SnippetErrors,
+    snippet_errors,
+    snippet_from_network,
+    snippets_from_trajectory,
+)
 from slam.evaluation.depth import DepthErrors
 from slam.evaluation.map import (
     ERRORS,
@@ -64,7 +69,10 @@ _EVERY_RENDERED = 5  # rendering a keyframe's true depth takes as long as refini
 
 
 def estimate_metrics(
-    result: Estimate, sequence: FrameSequence, provenance: records.Provenance, gps_in_graph: bool = True
+    result: Estimate,
+    sequence: FrameSequence,
+    provenance: records.Provenance,
+    gps_in_graph: bool = True,
 ) -> Metrics:
     """All metrics before the map is fused."""
     return Metrics.of(
@@ -77,7 +85,9 @@ def estimate_metrics(
         scale=_scale(result),
         agreement=[records.AgreementMetrics(**asdict(each)) for each in result.agreements],
         confidence=records.ConfidenceMetrics.of(run=result.confidence),
-        support=_BY_MAPS if (support := result.drive.support) is None else support.round(2).tolist(),
+        support=_BY_MAPS
+        if (support := result.drive.support) is None
+        else support.round(2).tolist(),
         trajectories=records.Trajectories.of(
             network=trajectory_metrics(result.network, result.reference, _network_snippets(result)),
             odometry=trajectory_metrics(result.odometry, result.reference),
@@ -133,7 +143,10 @@ def _sequence(result: Estimate, sequence: FrameSequence) -> records.SequenceMetr
 
 def _stretches(reasons: Mapping[int, str]) -> list[records.Stretch]:
     """Consecutive frames with the reason of the first."""
-    return [records.Stretch(first=first, last=last, reason=reasons[first]) for first, last in runs(reasons)]
+    return [
+        records.Stretch(first=first, last=last, reason=reasons[first])
+        for first, last in runs(reasons)
+    ]
 
 
 def _lidar_metrics(result: Estimate) -> TrajectoryMetrics | Failed:
@@ -142,7 +155,9 @@ def _lidar_metrics(result: Estimate) -> TrajectoryMetrics | Failed:
     if not isinstance(path, LidarPath):
         return path or Failed("the sequence has no LiDAR scans")
     reference = None if result.reference is None else result.reference.select(path.frames).rebased()
-    return trajectory_metrics(Trajectory(result.optimised.stamps[path.frames], path.T_world_camera), reference)
+    return trajectory_metrics(
+        Trajectory(result.optimised.stamps[path.frames], path.T_world_camera), reference
+    )
 
 
 def _network_snippets(result: Estimate) -> SnippetErrors | None:
@@ -176,7 +191,9 @@ def _graph(result: Estimate) -> records.GraphMetrics:
     covered = coverage(factors, result.reference.T_world_camera, aligned.scale)
     by_source = {source: records.CoverageMetrics.of(**shares) for source, shares in covered.items()}
     overall = by_source.pop("")
-    return records.GraphMetrics(nodes=nodes, factors=len(factors), coverage=overall, coverage_by_source=by_source)
+    return records.GraphMetrics(
+        nodes=nodes, factors=len(factors), coverage=overall, coverage_by_source=by_source
+    )
 
 
 def coverage(
@@ -194,7 +211,9 @@ def coverage(
     T_world_camera = T_world_camera_true.copy()
     T_world_camera[:, :3, 3] *= scale
     squared = whitened_squared(relative_poses, T_world_camera)
-    dofs, dof_of_factor = np.unique([edge.student_t_dof for edge in relative_poses], return_inverse=True)
+    dofs, dof_of_factor = np.unique(
+        [edge.student_t_dof for edge in relative_poses], return_inverse=True
+    )
     inside = {}
     for level in LEVELS:
         bounds = np.array([squared_bound(level / 100, dof) for dof in dofs])
@@ -202,7 +221,9 @@ def coverage(
     sources = np.array([edge.source for edge in relative_poses])
     found = {"": {level: float(within.mean()) for level, within in inside.items()}}
     for source in np.unique(sources):
-        ratios = {level: float(within[sources == source].mean()) for level, within in inside.items()}
+        ratios = {
+            level: float(within[sources == source].mean()) for level, within in inside.items()
+        }
         found[str(source)] = {"factors": int((sources == source).sum()), **ratios}
     return found
 
@@ -220,11 +241,20 @@ def squared_bound(probability: float, student_t_dof: float) -> float:
 
 def _loops(found: LoopClosures) -> records.LoopMetrics:
     """Loops by how far they came, and the reasons of the rejected ones with most inliers."""
-    counts = {"candidates": found.candidates, "verified": found.verified, "accepted": len(found.accepted)}
+    counts = {
+        "candidates": found.candidates,
+        "verified": found.verified,
+        "accepted": len(found.accepted),
+    }
     if found.not_sought is not None:
-        return records.LoopMetrics.of(**dict.fromkeys(counts, Failed(found.not_sought)), rejected=[])
+        return records.LoopMetrics.of(
+            **dict.fromkeys(counts, Failed(found.not_sought)), rejected=[]
+        )
     rejected = found.rejected[:MOST_REJECTED]
-    ends = [records.LoopEnds.of(from_=each.from_index, to=each.to_index, reason=each.reason) for each in rejected]
+    ends = [
+        records.LoopEnds.of(from_=each.from_index, to=each.to_index, reason=each.reason)
+        for each in rejected
+    ]
     return records.LoopMetrics.of(**counts, rejected=ends)
 
 
@@ -246,7 +276,9 @@ def _depth_error(result: Estimate) -> list[dict[str, float | None]] | Failed:
     curve, unit = result.drive.depth_error.curve(), float(np.median(result.scale.per_frame))
     if not curve:
         return Failed("no step triangulated corners with learned depth")
-    return [{"depth": unit * at, "bias": b, "sigma": s, "corners": count} for at, b, s, count in curve]
+    return [
+        {"depth": unit * at, "bias": b, "sigma": s, "corners": count} for at, b, s, count in curve
+    ]
 
 
 def _gps(result: Estimate, in_graph: bool) -> records.GpsMetrics | Failed:
@@ -262,13 +294,19 @@ def _gps(result: Estimate, in_graph: bool) -> records.GpsMetrics | Failed:
     return records.GpsMetrics.of(
         fixes=len(location.fixes.stamps),
         in_graph=in_graph,
-        origin=records.Origin(latitude_deg=latitude, longitude_deg=longitude, altitude_m=height, heading_deg=heading),
-        odometry=aligned if isinstance(aligned, Failed) else _distances(location.fixes, aligned, result.odometry),
+        origin=records.Origin(
+            latitude_deg=latitude, longitude_deg=longitude, altitude_m=height, heading_deg=heading
+        ),
+        odometry=aligned
+        if isinstance(aligned, Failed)
+        else _distances(location.fixes, aligned, result.odometry),
         optimised=_distances(location.fixes, location.T_enu_world, result.optimised),
     )
 
 
-def _distances(fixes: GpsFixes, T_enu_world: FloatArray, trajectory: Trajectory) -> records.GpsErrors:
+def _distances(
+    fixes: GpsFixes, T_enu_world: FloatArray, trajectory: Trajectory
+) -> records.GpsErrors:
     apart = fixes.offsets(T_enu_world @ trajectory.T_world_camera)
     level = np.linalg.norm(apart[:, :2], axis=1)
     return records.GpsErrors(
@@ -295,17 +333,25 @@ def depth_truth(sequence: RecordedSequence, reference: FloatArray) -> SurfaceTru
         step = int(np.ceil(np.sqrt(height * width / _MOST_PIXELS)))
         offset = frame % step  # other pixels in neighbouring frames
         rays = camera.rays(camera.pixel_grid()[offset::step, offset::step])
-        points = backprojected(depth[offset::step, offset::step], rays, T_world_camera, _DEPTH_RANGE_M)
+        points = backprojected(
+            depth[offset::step, offset::step], rays, T_world_camera, _DEPTH_RANGE_M
+        )
         return Surface(points, np.linalg.norm(points - T_world_camera[:3, 3], axis=1) <= RANGE_M)
 
-    def in_field(points: FloatArray, frames: Indices) -> Mask:  # all, for the map comes from the same images
+    def in_field(
+        points: FloatArray, frames: Indices
+    ) -> Mask:  # all, for the map comes from the same images
         return np.ones(len(points), dtype=bool)
 
     name = "depth maps" if exact is None else "exact surface"
-    return SurfaceTruth(name, np.array(sequence.true_depth_frames(), np.int64), view, in_field, distance)
+    return SurfaceTruth(
+        name, np.array(sequence.true_depth_frames(), np.int64), view, in_field, distance
+    )
 
 
-def lidar_truth(sequence: FrameSequence, reference: FloatArray, T_camera_lidar: FloatArray) -> SurfaceTruth:
+def lidar_truth(
+    sequence: FrameSequence, reference: FloatArray, T_camera_lidar: FloatArray
+) -> SurfaceTruth:
     """LiDAR scans at true poses ``(N, 4, 4)``, points within 25 m of the scanner; moving objects are among them.
 
     A scan that cannot be read, of which LiDAR odometry has warned, has no point. Completeness is about points in the
@@ -320,7 +366,9 @@ def lidar_truth(sequence: FrameSequence, reference: FloatArray, T_camera_lidar: 
             points = np.empty((0, 3))
         ranges = np.linalg.norm(points, axis=1)
         sines = points[ranges > 1.0, 2] / ranges[ranges > 1.0]
-        beams = np.quantile(sines, [0.001, 0.999]) if len(sines) else (1.0, -1.0)  # stray points left out
+        beams = (
+            np.quantile(sines, [0.001, 0.999]) if len(sines) else (1.0, -1.0)
+        )  # stray points left out
         limits[frame] = float(beams[0]), float(beams[1])
         points = apply(T_camera_lidar, points[ranges <= RANGE_M])
         return Surface(apply(reference[frame], points), _in_image(points, sequence.intrinsics))
@@ -343,7 +391,9 @@ def _in_image(points: FloatArray, camera: Intrinsics) -> Mask:
     """Which points of a camera ``(P, 3)`` project into its image."""
     inside: Mask = points[:, 2] > _NEAREST_M
     pixels = camera.project(points[inside])
-    inside[inside] = ((pixels > -0.5) & (pixels < np.array([camera.width, camera.height]) - 0.5)).all(axis=1)
+    inside[inside] = (
+        (pixels > -0.5) & (pixels < np.array([camera.width, camera.height]) - 0.5)
+    ).all(axis=1)
     return inside
 
 
@@ -354,12 +404,17 @@ def find_truth(sequence: FrameSequence) -> SurfaceTruth | str:
         return "the sequence has no true poses"
     if isinstance(sequence, RecordedSequence) and sequence.true_depth_frames():
         return depth_truth(sequence, reference)
-    if T_camera_lidar is not None and (lidar := lidar_truth(sequence, reference, T_camera_lidar)).frames.size:
+    if (
+        T_camera_lidar is not None
+        and (lidar := lidar_truth(sequence, reference, T_camera_lidar)).frames.size
+    ):
         return lidar
     return "the true surface is not known: there are neither depth maps nor LiDAR scans beside the images"
 
 
-def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, sequence: FrameSequence) -> dict[str, Any]:
+def map_errors(
+    pieces: Callable[[], Iterator[FloatArray]], result: Estimate, sequence: FrameSequence
+) -> dict[str, Any]:
     """Values of `MapMetrics`: errors of a map moved to the truth rigidly, and under ``with_scale`` by a similarity.
 
     ``pieces`` iterates over the points of the map, ``(P, 3)`` each; of a long drive only those near the stretches that
@@ -373,7 +428,9 @@ def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, seq
     fits = {"with_scale": pose_similarity(sequence.reference, poses)}
     if result.scale.is_metric:
         fits["rigid"] = pose_similarity(sequence.reference, poses, with_scale=False)
-    looked_at = np.concatenate([*stretches(sequence.reference, truth.frames), np.empty(0, np.int64)]).astype(np.int64)
+    looked_at = np.concatenate(
+        [*stretches(sequence.reference, truth.frames), np.empty(0, np.int64)]
+    ).astype(np.int64)
     cameras = cKDTree(sequence.reference[looked_at, :3, 3])
     placed = {name: _placed(pieces(), fit, cameras) for name, fit in fits.items()}
     try:
@@ -382,10 +439,14 @@ def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, seq
         logger.warning("the error of the map is not known: %s", error)
         return dict.fromkeys(_MAP_ERRORS, Failed(str(error)))
     if truth.distance is None and len(distances["with_scale"].to_map) == 0:
-        return dict.fromkeys(_MAP_ERRORS, Failed("no point of the true surface is known near the images"))
+        return dict.fromkeys(
+            _MAP_ERRORS, Failed("no point of the true surface is known near the images")
+        )
     no_metres = dict.fromkeys(ERRORS, Failed("lengths are not in metres: see with_scale"))
     errors = placed_errors(distances["rigid"]) if "rigid" in fits else no_metres
-    with_scale = PlacedMetrics.of(**placed_errors(distances["with_scale"]), scale=fits["with_scale"].scale)
+    with_scale = PlacedMetrics.of(
+        **placed_errors(distances["with_scale"]), scale=fits["with_scale"].scale
+    )
     return {**errors, "truth": truth.name, "evaluated_m": length_m, "with_scale": with_scale}
 
 
@@ -394,7 +455,9 @@ def _placed(pieces: Iterator[FloatArray], fit: Similarity, cameras: cKDTree) -> 
     near = [np.empty((0, 3))]
     for points in pieces:
         moved = fit.scale * points @ fit.R_a_b.T + fit.t_a_b
-        near.append(moved[np.isfinite(cameras.query(moved, distance_upper_bound=RANGE_M + OUTLIER_M)[0])])
+        near.append(
+            moved[np.isfinite(cameras.query(moved, distance_upper_bound=RANGE_M + OUTLIER_M)[0])]
+        )
     return np.concatenate(near)
 
 
@@ -420,7 +483,9 @@ class DepthQuality:
             return
         if truth is None:
             return
-        self._network.add(keyframe.depth if keyframe.network_depth is None else keyframe.network_depth, truth)
+        self._network.add(
+            keyframe.depth if keyframe.network_depth is None else keyframe.network_depth, truth
+        )
         if keyframe.relative_sigma is not None:
             self._refined.add(keyframe.depth, truth, keyframe.relative_sigma)
 
@@ -440,7 +505,11 @@ class DepthQuality:
             missing = "the sequence has no true depth (simulated, depth_2 or LiDAR)"
         if network is None:
             return DepthOfKeyframes.unknown(missing)
-        unrefined = "no keyframe has a neighbour at a useful distance" if is_refined else "depth.refine is none"
+        unrefined = (
+            "no keyframe has a neighbour at a useful distance"
+            if is_refined
+            else "depth.refine is none"
+        )
         return DepthOfKeyframes.of(network=network, refined=refined or Failed(unrefined))
 
 
@@ -458,7 +527,9 @@ def true_depth(sequence: FrameSequence, index: int, count: int = 1) -> DepthMap 
     return projected(sequence.scan(index), sequence.T_camera_lidar, sequence.intrinsics)
 
 
-def projected(points_lidar: FloatArray, T_camera_lidar: FloatArray, intrinsics: Intrinsics) -> DepthMap:
+def projected(
+    points_lidar: FloatArray, T_camera_lidar: FloatArray, intrinsics: Intrinsics
+) -> DepthMap:
     """z-depth ``(H, W)`` of LiDAR points ``(P, 3)`` in the image, the nearest at each pixel, 0 where there is none."""
     points = apply(T_camera_lidar, np.asarray(points_lidar, np.float64))
     points = points[_in_image(points, intrinsics)]

@@ -55,7 +55,9 @@ class RunFolder:
             raise RunError(f"{path} is not there: give a folder that 'erfsfm-slam run' wrote")
 
     @classmethod
-    def create(cls, output: Path | None, results: Path, sequence: str, lock: FolderLock | None = None) -> RunFolder:
+    def create(
+        cls, output: Path | None, results: Path, sequence: str, lock: FolderLock | None = None
+    ) -> RunFolder:
         """A new folder: ``output`` itself, or ``results/<stamp>_<sequence>`` with ``results/latest`` linked to it.
 
         Where ``output`` holds an earlier run, that is removed. A ``lock`` holds the folder from now on.
@@ -78,7 +80,9 @@ class RunFolder:
             return cls(output)
         except OSError as error:
             where = output if output is not None else results
-            raise RunError(f"no run folder can be made in {where}: {error.strerror or error}") from error
+            raise RunError(
+                f"no run folder can be made in {where}: {error.strerror or error}"
+            ) from error
 
     @classmethod
     def open(cls, path: str | Path) -> RunFolder:
@@ -90,7 +94,9 @@ class RunFolder:
         path = Path(path)
         if not (path / METRICS).is_file() and not (path / ESTIMATE).is_file():
             what = "no such folder" if not path.exists() else f"it holds no {METRICS}"
-            raise RunError(f"{path} is not a run folder: {what}; give a folder that 'erfsfm-slam run' wrote")
+            raise RunError(
+                f"{path} is not a run folder: {what}; give a folder that 'erfsfm-slam run' wrote"
+            )
         folder = cls(path)
         metrics = folder.metrics()
         if metrics.failure:
@@ -115,7 +121,9 @@ class RunFolder:
         try:
             return Metrics.read(self.path / METRICS)
         except FileNotFoundError:
-            return Metrics(schema_=1, status="running", reason=f"the run was killed before it wrote {METRICS}")
+            return Metrics(
+                schema_=1, status="running", reason=f"the run was killed before it wrote {METRICS}"
+            )
 
     def trajectory(self, name: str) -> Trajectory | None:
         """One of the trajectories (``network``, ``optimised``, ``reference`` ...), or None where absent."""
@@ -139,13 +147,17 @@ class RunFolder:
         if (self.path / REPORT).is_file():
             notes.append(f"Report: {self.path / REPORT}")
         table = errors_table(errors).html() if errors else ""
-        return f"<h4>{escape(title)}</h4>{table}" + "".join(f"<p>{escape(note)}</p>" for note in notes)
+        return f"<h4>{escape(title)}</h4>{table}" + "".join(
+            f"<p>{escape(note)}</p>" for note in notes
+        )
 
     def require(self, name: str) -> Path:
         """The path of a file of the run."""
         path = self.path / name
         if not path.is_file():
-            present = ", ".join(sorted(p.name for p in self.path.iterdir() if not p.name.startswith(".")))
+            present = ", ".join(
+                sorted(p.name for p in self.path.iterdir() if not p.name.startswith("."))
+            )
             why = f"it holds {present}"
             if name.endswith(".ply"):
                 metrics = self.metrics()
@@ -159,10 +171,14 @@ def check_replaced(path: Path, begin: bytes | None = None) -> None:
     """Check what a file would replace: a file with this ``begin``, by default any trajectory."""
     if path.is_dir():
         raise RunError(f"{path} is a folder: give the name of a file to write")
-    if path.name in MEANINGS and any((path.parent / name).is_file() for name in (METRICS, ESTIMATE)):
+    if path.name in MEANINGS and any(
+        (path.parent / name).is_file() for name in (METRICS, ESTIMATE)
+    ):
         raise RunError(f"{path} is a file of a run: choose another --output")
     if path.is_file() and path.stat().st_size and not _is_of_kind(path, begin):
-        raise RunError(f"{path} exists and is a file of another kind than is written: choose another --output")
+        raise RunError(
+            f"{path} exists and is a file of another kind than is written: choose another --output"
+        )
 
 
 def _is_of_kind(path: Path, begin: bytes | None) -> bool:
@@ -178,13 +194,19 @@ def _is_of_kind(path: Path, begin: bytes | None) -> bool:
 def check_output(output: Path) -> None:
     """Check that a run may write to ``output``: it is new, empty, or holds an earlier run."""
     if output.is_symlink() and not output.exists():
-        raise RunError(f"{output} is a link to {output.readlink()}, which is not there: choose another --output")
+        raise RunError(
+            f"{output} is a link to {output.readlink()}, which is not there: choose another --output"
+        )
     if not output.exists():
         return
     if not output.is_dir():
         raise RunError(f"{output} is a file: give a folder as --output")
-    if not _is_run(output / METRICS) and any(unfinished_name(path) not in MEANINGS for path in output.iterdir()):
-        raise RunError(f"{output} is not empty and holds no run of erfsfm-slam: choose another --output")
+    if not _is_run(output / METRICS) and any(
+        unfinished_name(path) not in MEANINGS for path in output.iterdir()
+    ):
+        raise RunError(
+            f"{output} is not empty and holds no run of erfsfm-slam: choose another --output"
+        )
 
 
 def _stamped(results: Path, sequence: str) -> Path:
@@ -207,7 +229,10 @@ def _is_run(metrics: Path) -> bool:
         content = Metrics.read(metrics)
     except (OSError, RunError):
         return False
-    return content.provenance.weights_sha256 is not None and {"schema_", "status"} <= content.model_fields_set
+    return (
+        content.provenance.weights_sha256 is not None
+        and {"schema_", "status"} <= content.model_fields_set
+    )
 
 
 def _link(link: Path, target: Path) -> None:

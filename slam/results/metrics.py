@@ -244,9 +244,13 @@ class Metrics(Record):
 
     def changed(self, **values: Any) -> Metrics:
         """With other values; None takes one out."""
-        own = {name: getattr(self, name) for name in self.model_fields_set - {"absent", "reasons"}} | values
+        own = {
+            name: getattr(self, name) for name in self.model_fields_set - {"absent", "reasons"}
+        } | values
         reasons = {name: why for name, why in self.reasons.items() if name not in values}
-        return Metrics.of(**{k: v for k, v in own.items() if v is not None or k in reasons}, reasons=reasons)
+        return Metrics.of(
+            **{k: v for k, v in own.items() if v is not None or k in reasons}, reasons=reasons
+        )
 
     def all_errors(self) -> dict[str, TrajectoryMetrics]:
         """Errors by trajectory, also of absent ones."""
@@ -254,12 +258,18 @@ class Metrics(Record):
 
     def evaluated_errors(self) -> dict[str, TrajectoryMetrics]:
         """Errors of the trajectories that have them."""
-        return {} if self.trajectories.absent else {k: each for k, each in self.all_errors().items() if not each.absent}
+        return (
+            {}
+            if self.trajectories.absent
+            else {k: each for k, each in self.all_errors().items() if not each.absent}
+        )
 
     @property
     def failure(self) -> str:
         """Why the run failed or did not end, in one line; empty if it is whole."""
-        return "" if self.status == "ok" else " ".join((self.reason or "no reason recorded").split())
+        return (
+            "" if self.status == "ok" else " ".join((self.reason or "no reason recorded").split())
+        )
 
     @property
     def unit(self) -> str:
@@ -281,9 +291,13 @@ class Metrics(Record):
         fitted = "Only the alignments with scale (scale, 7 dof) compare with metres. For metres:"
         if self.unit == CAMERA_HEIGHTS:
             why = "Scale mode none: lengths are in camera heights of the learned road plane, not in metres."
-            return [f"{why} {fitted} camera_height_m in camera.yaml, a GPS track or scale.mode=known."]
+            return [
+                f"{why} {fitted} camera_height_m in camera.yaml, a GPS track or scale.mode=known."
+            ]
         if self.unit == NO_UNIT:
             why = f"No metric unit: {self.scale.frames_used} of {self.sequence.frames} frames see a road."
-            known = "--set scale.mode=known --set scale.known_between=[0,50] --set scale.known_m=1.5"
+            known = (
+                "--set scale.mode=known --set scale.known_between=[0,50] --set scale.known_m=1.5"
+            )
             return [f"{why} {fitted} give the distance of two frames, {known}."]
         return [why]

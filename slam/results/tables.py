@@ -94,7 +94,10 @@ def alignments_table(errors: TrajectoryMetrics, title: str = "") -> Table:
     statistics = AlignedMetrics.statistics()
     values = {how: [errors.at(f"align.{how}.{key}") for key in statistics] for how in ALIGNMENTS}
     rows = [
-        [how, *(written(value, each.decimals) for (value, _), each in zip(row, statistics.values()))]
+        [
+            how,
+            *(written(value, each.decimals) for (value, _), each in zip(row, statistics.values())),
+        ]
         for how, row in values.items()
     ]
     missing = {reason: None for row in values.values() for value, reason in row if value is None}
@@ -143,7 +146,9 @@ def runs_json(runs: Sequence[tuple[Path, Metrics]]) -> list[dict[str, Any]]:
         if metrics.failure:
             entry["reason"] = metrics.failure
         entry["leak"] = metrics.provenance.leak
-        objects.append(entry | {key: tree.get(key) for key in ("sequence", "scale", "trajectories")})
+        objects.append(
+            entry | {key: tree.get(key) for key in ("sequence", "scale", "trajectories")}
+        )
     return objects
 
 
@@ -186,7 +191,11 @@ def key_numbers(metrics: Metrics, has_map: bool) -> list[tuple[str, str, str]]:
         ("Loops accepted", metrics.loops.accepted, 0, ""),
         ("Map triangles", metrics.map.triangles if has_map else None, 0, ""),
     ]
-    return [(name, number(value, decimals), unit) for name, value, decimals, unit in wanted if value is not None]
+    return [
+        (name, number(value, decimals), unit)
+        for name, value, decimals, unit in wanted
+        if value is not None
+    ]
 
 
 def what_ran(metrics: Metrics) -> Table:
@@ -237,10 +246,17 @@ def map_errors(metrics: Metrics) -> Table | None:
         rows["where the scanner looked"] = found.in_field
     rows["with one scale"] = found.with_scale
     rings = found.with_scale.by_distance if found.by_distance is None else found.by_distance
-    rows |= {f"{ring.from_m:.0f} to {ring.to_m:.0f} m from the camera": ring for ring in rings or ()}
-    texts = [[name, *(number(each.at(path)[0], 3) for path in _MAP_ERRORS.values())] for name, each in rows.items()]
+    rows |= {
+        f"{ring.from_m:.0f} to {ring.to_m:.0f} m from the camera": ring for ring in rings or ()
+    }
+    texts = [
+        [name, *(number(each.at(path)[0], 3) for path in _MAP_ERRORS.values())]
+        for name, each in rows.items()
+    ]
     truth, length = _TRUTHS.get(found.truth, found.truth), number(found.evaluated_m)
-    note = f"Against {truth}, {length} m of the path. Map where no surface was measured is an error."
+    note = (
+        f"Against {truth}, {length} m of the path. Map where no surface was measured is an error."
+    )
     return Table(("", *_MAP_ERRORS), texts, notes=[f"{note} {fused}"])
 
 
@@ -251,10 +267,19 @@ def timing(metrics: Metrics) -> Table | None:
         return None
     timed = sum(stages.values())
     total = max(metrics.timing.seconds_total or 0.0, timed, 1e-9)
-    shares = {name: seconds / total for name, seconds in (stages | {"between stages": total - timed}).items()}
+    shares = {
+        name: seconds / total
+        for name, seconds in (stages | {"between stages": total - timed}).items()
+    }
     ordered = sorted(shares.items(), key=lambda item: -item[1])
-    rows = [[name, f"{share * total:.1f}", f"{share:.0%}"] for name, share in ordered if share >= _LEAST_SHARE]
-    memory, processor = (number(each) for each in (metrics.timing.peak_rss_mb, metrics.timing.cpu_seconds))
+    rows = [
+        [name, f"{share * total:.1f}", f"{share:.0%}"]
+        for name, share in ordered
+        if share >= _LEAST_SHARE
+    ]
+    memory, processor = (
+        number(each) for each in (metrics.timing.peak_rss_mb, metrics.timing.cpu_seconds)
+    )
     note = f"{total:.1f} s in all, {processor} s of processor time, at most {memory} MiB of memory."
     return Table(("stage", "seconds", "share"), rows, notes=[note])
 
@@ -316,9 +341,17 @@ def verdict(metrics: Metrics) -> Verdict | None:
     if metrics.failure:
         return None
     scraps = _scraps(metrics)
-    said = [*_confidence(metrics), *_loops(metrics), *_agreement(metrics), *_unit(metrics), *_noise(metrics)]
+    said = [
+        *_confidence(metrics),
+        *_loops(metrics),
+        *_agreement(metrics),
+        *_unit(metrics),
+        *_noise(metrics),
+    ]
     said += [*_rest(metrics), *([(False, scraps)] if scraps else [])]
-    signs, doubts = ([words for is_sign, words in said if is_sign == wanted] for wanted in (True, False))
+    signs, doubts = (
+        [words for is_sign, words in said if is_sign == wanted] for wanted in (True, False)
+    )
     return Verdict(_sentence(metrics), signs, doubts, scraps)
 
 
@@ -334,14 +367,22 @@ def _sentence(metrics: Metrics) -> str:
     unit = f"its lengths {unit if metrics.unit == CAMERA_HEIGHTS else 'have no metric unit'}"
     if error is None:
         sure = metrics.confidence.run
-        likely = f": {percent(sure)} of drives like it err by at most 1 % of their path" if sure is not None else ""
+        likely = (
+            f": {percent(sure)} of drives like it err by at most 1 % of their path"
+            if sure is not None
+            else ""
+        )
         closed = next((f", and {words}" for is_sign, words in _loops(metrics) if is_sign), "")
         unit = "its lengths are in metres" if metrics.is_metric else unit
         return f"Without a truth its error is unknown{likely}{closed}; {unit}."
     part = f", {percent(error / length)} of its {length:.3g} m" if length else ""
     after = f"after one fitted scale; {unit}"
     if metrics.is_metric:
-        after = "with its scale from the truth" if metrics.scale.mode == "reference" else "with its own metric scale"
+        after = (
+            "with its scale from the truth"
+            if metrics.scale.mode == "reference"
+            else "with its own metric scale"
+        )
     return f"The trajectory is {error:.2g} m off the truth (RMSE{part}), {after}."
 
 
@@ -349,16 +390,25 @@ def _unit(metrics: Metrics) -> Iterator[tuple[bool, str]]:
     scale, spread = metrics.scale, metrics.scale.spread
     if metrics.unit == METRES and (source := _FROM.get(scale.mode or "")):
         certain = f" (spread {percent(spread)})" if spread is not None else ""
-        yield scale.mode != "reference" and (spread or 0.0) < _WIDE_SPREAD, f"metres come from {source}{certain}"
+        yield (
+            scale.mode != "reference" and (spread or 0.0) < _WIDE_SPREAD,
+            f"metres come from {source}{certain}",
+        )
     fitted = metrics.trajectories.optimised.align.dof7.scale
     if metrics.is_metric and fitted and abs(fitted - 1.0) > _LARGEST_SCALE_ERROR:
-        yield False, f"lengths are {percent(abs(1.0 / fitted - 1.0))} too {'short' if fitted > 1.0 else 'long'}"
+        yield (
+            False,
+            f"lengths are {percent(abs(1.0 / fitted - 1.0))} too {'short' if fitted > 1.0 else 'long'}",
+        )
 
 
 def _loops(metrics: Metrics) -> Iterator[tuple[bool, str]]:
     accepted = metrics.loops.accepted
     if accepted:
-        yield True, f"{accepted} of {_count(metrics.loops.verified or accepted, 'measured loop')} agree and close it"
+        yield (
+            True,
+            f"{accepted} of {_count(metrics.loops.verified or accepted, 'measured loop')} agree and close it",
+        )
     elif accepted == 0:
         yield False, f"no loop closes it ({metrics.loops.candidates} candidates), so drift adds up"
     else:
@@ -368,7 +418,10 @@ def _loops(metrics: Metrics) -> Iterator[tuple[bool, str]]:
 def _confidence(metrics: Metrics) -> Iterator[tuple[bool, str]]:
     sure = metrics.confidence.run
     if sure is not None:
-        yield sure > _SURE, f"{percent(sure)} of drives with images like its own err by at most 1 % of their path"
+        yield (
+            sure > _SURE,
+            f"{percent(sure)} of drives with images like its own err by at most 1 % of their path",
+        )
     elif not metrics.confidence.absent:
         yield False, f"its confidence is not known: {metrics.confidence.why('run')}"
 
@@ -377,7 +430,10 @@ def _agreement(metrics: Metrics) -> Iterator[tuple[bool, str]]:
     for each in metrics.agreement or ():
         agrees = (each.sigmas or 0.0) <= DOUBTFUL
         if each.beside == "the images":
-            yield agrees, f"{each.source} {'agrees with' if agrees else 'contradicts'} the images: {each.figure}"
+            yield (
+                agrees,
+                f"{each.source} {'agrees with' if agrees else 'contradicts'} the images: {each.figure}",
+            )
         elif not agrees:  # `_confidence` says of all whether the run is like good ones
             yield False, f"{each.source}: {each.figure}"
     off = metrics.gps.optimised.horizontal_rmse_m
@@ -388,10 +444,22 @@ def _agreement(metrics: Metrics) -> Iterator[tuple[bool, str]]:
 
 def _noise(metrics: Metrics) -> Iterator[tuple[bool, str]]:
     coverage = metrics.graph.coverage
-    shares = [each for each in (coverage.inside_50, coverage.inside_90, coverage.inside_95) if each is not None]
+    shares = [
+        each
+        for each in (coverage.inside_50, coverage.inside_90, coverage.inside_95)
+        if each is not None
+    ]
     if len(shares) == 3:
-        worst = max((share - promised for share, promised in zip(shares, (0.5, 0.9, 0.95))), key=abs)
-        how = "holds" if abs(worst) < _NOISE_POINTS else "is too small" if worst < 0 else "is too large"
+        worst = max(
+            (share - promised for share, promised in zip(shares, (0.5, 0.9, 0.95))), key=abs
+        )
+        how = (
+            "holds"
+            if abs(worst) < _NOISE_POINTS
+            else "is too small"
+            if worst < 0
+            else "is too large"
+        )
         told = ", ".join(f"{100 * share:.0f}" for share in shares)
         numbers = f"{told} % of its measurements lie inside their 50, 90, 95 % bounds"
         yield how == "holds", f"its stated noise {how}: {numbers}"
@@ -401,9 +469,16 @@ def _rest(metrics: Metrics) -> Iterator[tuple[bool, str]]:
     if doubled := sum(each.last - each.first + 1 for each in metrics.sequence.doubled or ()):
         yield False, f"{_count(doubled, 'frame')} repeat the one before while the camera moves"
     if (maps := metrics.tracking.maps or 1) > 1:
-        events = [event for event in metrics.tracking.events or () if event.frame and "begun" in event.event]
+        events = [
+            event
+            for event in metrics.tracking.events or ()
+            if event.frame and "begun" in event.event
+        ]
         lost = ", ".join(str(event.frame) for event in events)
-        yield False, f"tracking was lost{f' at frames {lost}' if lost else ''}: {maps} maps are not joined"
+        yield (
+            False,
+            f"tracking was lost{f' at frames {lost}' if lost else ''}: {maps} maps are not joined",
+        )
     if metrics.provenance.leak is True:
         yield False, "LEAK: its weights saw this sequence, or a part of it, in training"
     if (off := metrics.map.accuracy_median_m) is not None:

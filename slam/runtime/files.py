@@ -54,7 +54,10 @@ MEANINGS = {
 
 
 def write_atomically(
-    path: Path, content: str | bytes | Callable[[Path], object], error: type[SlamError] = SlamError, sync: bool = True
+    path: Path,
+    content: str | bytes | Callable[[Path], object],
+    error: type[SlamError] = SlamError,
+    sync: bool = True,
 ) -> None:
     """`erfsfm.common.files.write_atomically` that raises a `SlamError`.
 

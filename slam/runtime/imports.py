@@ -15,7 +15,10 @@ from slam.runtime.errors import SlamError
 # of each optional extra: what needs it, and its modules
 EXTRAS: dict[str, tuple[str, tuple[str, ...]]] = {
     "cluster": ("several workers and schedulers need Dask", ("distributed",)),
-    "download": ("download needs remotezip and requests", ("remotezip", "requests", "urllib3.exceptions")),
+    "download": (
+        "download needs remotezip and requests",
+        ("remotezip", "requests", "urllib3.exceptions"),
+    ),
     "rerun": ("--rerun and --view need rerun", ("rerun",)),
     "ros": ("bags need rosbags", ("rosbags.rosbag1", "rosbags.rosbag2", "rosbags.typesys")),
 }
@@ -31,7 +34,9 @@ def import_open3d() -> ModuleType:
         ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
         return _without_windows()
     except (ImportError, OSError) as error:
-        raise SlamError(f"Open3D cannot be loaded ({error}); install open3d-cpu and libusb-package") from error
+        raise SlamError(
+            f"Open3D cannot be loaded ({error}); install open3d-cpu and libusb-package"
+        ) from error
 
 
 def _without_windows() -> ModuleType:
@@ -77,7 +82,9 @@ def import_plug_in(point: EntryPoint) -> Any:
         return point.load()
     except (ImportError, AttributeError, OSError) as error:
         package = "another package" if point.dist is None else point.dist.name
-        raise SlamError(f"{point.name} of {package} cannot be loaded ({error}): repair or uninstall it") from error
+        raise SlamError(
+            f"{point.name} of {package} cannot be loaded ({error}): repair or uninstall it"
+        ) from error
 
 
 def import_open3d_beside() -> None:

@@ -8,7 +8,14 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_serializer, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
 from erfsfm.common.config_tree import first_problem
 from erfsfm.common.files import read_text
@@ -98,14 +105,22 @@ class Record(BaseModel):
         """
         try:
             content = json.loads(read_text(path))
-            json.dumps(content, ensure_ascii=False).encode()  # half a surrogate pair cannot be printed
+            json.dumps(
+                content, ensure_ascii=False
+            ).encode()  # half a surrogate pair cannot be printed
             return cls.model_validate(content)
         except FileNotFoundError:
             raise
         except PermissionError as error:
-            raise RunError(f"{path} cannot be read: {error.strerror}: check its permissions") from error
+            raise RunError(
+                f"{path} cannot be read: {error.strerror}: check its permissions"
+            ) from error
         except (OSError, ValueError, RecursionError) as error:
-            reason = first_problem(error) if isinstance(error, ValidationError) else getattr(error, "strerror", None)
+            reason = (
+                first_problem(error)
+                if isinstance(error, ValidationError)
+                else getattr(error, "strerror", None)
+            )
             text = " ".join(str(reason or error).split())
             raise RunError(f"{path} is damaged: {text}; run the sequence again") from error
 

@@ -109,7 +109,9 @@ class SpillFile:
                 self._file.seek(start)
                 return np.fromfile(self._file, dtype, count).reshape(shape)
         except (OSError, ValueError) as error:
-            raise SlamError(f"{self._what} in {tempfile.gettempdir()} cannot be read ({error}): run again") from error
+            raise SlamError(
+                f"{self._what} in {tempfile.gettempdir()} cannot be read ({error}): run again"
+            ) from error
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,9 @@ IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedIm
 CAMERA_INFO, POINT_CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
 
 SIXTEEN_BITS = ("mono16", "16UC1")
-_CONVERSIONS: dict[str, tuple[int, int | None]] = {  # encoding: channels, OpenCV's conversion to RGB
+_CONVERSIONS: dict[
+    str, tuple[int, int | None]
+] = {  # encoding: channels, OpenCV's conversion to RGB
     "rgb8": (3, None),
     **dict.fromkeys(("8UC3", "bgr8"), (3, cv2.COLOR_BGR2RGB)),
     "rgba8": (4, cv2.COLOR_RGBA2RGB),
@@ -69,16 +71,22 @@ class Bag:
             self._reader: Any = (rosbag1 if self._is_ros1 else rosbag2).Reader(path)
             self._reader.open()
             stores = typesys.Stores
-            self._types = typesys.get_typestore(stores.ROS1_NOETIC if self._is_ros1 else stores.ROS2_HUMBLE)
+            self._types = typesys.get_typestore(
+                stores.ROS1_NOETIC if self._is_ros1 else stores.ROS2_HUMBLE
+            )
             for name in _TRANSFORM_TYPES:
                 if name not in self._types.types:
                     self._types.register(typesys.get_types_from_msg(_TRANSFORMS, name))
-            self.types: dict[str, str] = {each.topic: each.msgtype for each in self._reader.connections}
+            self.types: dict[str, str] = {
+                each.topic: each.msgtype for each in self._reader.connections
+            }
 
     def topics(self, *types: str) -> list[str]:
         """Topics of some message types that have messages, sorted."""
         counts = {each.topic: each.msgcount for each in self._reader.connections}
-        return sorted(topic for topic, kind in self.types.items() if kind in types and counts[topic] != 0)
+        return sorted(
+            topic for topic, kind in self.types.items() if kind in types and counts[topic] != 0
+        )
 
     def raw(self, topic: str, start_ns: int | None = None) -> Iterator[tuple[int, bytes]]:
         """The messages of a topic as stored, with the times at which they were recorded, from ``start_ns`` on."""
@@ -109,10 +117,14 @@ class Bag:
         """The stamp in nanoseconds of a message as stored whose first field is a header, without reading all of it."""
         with self._errors():
             if self._is_ros1:
-                seconds, nanoseconds = struct.unpack_from("<II", data, 4)  # after the sequence number
+                seconds, nanoseconds = struct.unpack_from(
+                    "<II", data, 4
+                )  # after the sequence number
             else:
                 order = "<" if data[1] & 1 else ">"
-                seconds, nanoseconds = struct.unpack_from(f"{order}iI", data, 4)  # after the encapsulation
+                seconds, nanoseconds = struct.unpack_from(
+                    f"{order}iI", data, 4
+                )  # after the encapsulation
         return int(seconds) * _NANOSECONDS + int(nanoseconds)
 
     def close(self) -> None:
@@ -130,8 +142,12 @@ class Bag:
             held = ", ".join(foreign_topics(self.path) if self.path.suffix == ".mcap" else [])
             if held:
                 cure = "convert it to a bag of ROS 2"
-                raise SequenceError(f"{self.path} is not of ROS: it holds {held}; {cure}") from error
-            raise SequenceError(f"bag {self.path} cannot be read ({reason}): copy it again, or reindex it") from error
+                raise SequenceError(
+                    f"{self.path} is not of ROS: it holds {held}; {cure}"
+                ) from error
+            raise SequenceError(
+                f"bag {self.path} cannot be read ({reason}): copy it again, or reindex it"
+            ) from error
 
 
 def foreign_topics(path: Path) -> list[str]:
@@ -139,7 +155,10 @@ def foreign_topics(path: Path) -> list[str]:
     found, schemas = [], {0: "no schema"}
     try:
         data = path.read_bytes()
-        place, end = struct.unpack_from("<Q", data, len(data) - _FOOTER_BYTES + 9)[0], len(data) - _FOOTER_BYTES
+        place, end = (
+            struct.unpack_from("<Q", data, len(data) - _FOOTER_BYTES + 9)[0],
+            len(data) - _FOOTER_BYTES,
+        )
         while 0 < place < end:
             kind, length = struct.unpack_from("<BQ", data, place)
             content, place = data[place + 9 : place + 9 + length], place + 9 + length
@@ -149,7 +168,9 @@ def foreign_topics(path: Path) -> list[str]:
                 topic, after = _text(content, 4)
                 encoding = _text(content, after)[0]
                 if encoding not in _ROS_ENCODINGS:
-                    found.append(f"{topic} ({schemas.get(struct.unpack_from('<H', content, 2)[0])}, {encoding})")
+                    found.append(
+                        f"{topic} ({schemas.get(struct.unpack_from('<H', content, 2)[0])}, {encoding})"
+                    )
     except (OSError, struct.error, UnicodeDecodeError):
         return []
     return found
@@ -164,7 +185,9 @@ def _text(content: bytes, start: int) -> tuple[str, int]:
 def is_bag(path: Path) -> bool:
     """Whether a path has the name of a bag, or is the folder of a ROS 2 bag."""
     if path.is_dir():
-        return (path / _METADATA).is_file() and any(file.suffix in BAG_SUFFIXES[1:] for file in path.iterdir())
+        return (path / _METADATA).is_file() and any(
+            file.suffix in BAG_SUFFIXES[1:] for file in path.iterdir()
+        )
     return path.suffix in BAG_SUFFIXES
 
 
@@ -184,12 +207,16 @@ def values_of(message: Any, where: str) -> NDArray[Any]:
     if encoding not in _CONVERSIONS:
         raise SequenceError(f"{where} has encoding {encoding}; known are {', '.join(_CONVERSIONS)}")
     channels, _ = _CONVERSIONS[encoding]
-    sample = np.dtype(f"{'>' if message.is_bigendian else '<'}u{2 if encoding in SIXTEEN_BITS else 1}")
+    sample = np.dtype(
+        f"{'>' if message.is_bigendian else '<'}u{2 if encoding in SIXTEEN_BITS else 1}"
+    )
     height, width, step = message.height, message.width, message.step
     row = width * channels * sample.itemsize
     data = np.asarray(message.data, dtype=np.uint8)
     if not 0 < row <= step or len(data) < height * step:
-        raise SequenceError(f"{where} has {len(data)} bytes for {width}x{height} pixels of {encoding}")
+        raise SequenceError(
+            f"{where} has {len(data)} bytes for {width}x{height} pixels of {encoding}"
+        )
     values = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :row]).view(sample)
     return values.reshape(height, width, channels).astype(sample.newbyteorder("="))
 
@@ -204,7 +231,9 @@ def image_of(message: Any, where: str, stretch: Stretch | None = None) -> Image:
     picture, (_, conversion) = values_of(message, where), _CONVERSIONS[message.encoding]
     if picture.dtype == np.uint16:
         picture = (stretch or Stretch.of([picture])).apply(picture)
-    return np.array(picture if conversion is None else cv2.cvtColor(picture, conversion), dtype=np.uint8)
+    return np.array(
+        picture if conversion is None else cv2.cvtColor(picture, conversion), dtype=np.uint8
+    )
 
 
 def camera_file_of(
@@ -215,7 +244,9 @@ def camera_file_of(
     The calibration is of the whole sensor; images are its region of interest, binned (REP 104). Some drivers state a
     binning of images that are whole: those of ``size`` (width, height) as large as the calibration are.
     """
-    K, P, distortion = (getattr(info, key.upper() if hasattr(info, key.upper()) else key) for key in "kpd")
+    K, P, distortion = (
+        getattr(info, key.upper() if hasattr(info, key.upper()) else key) for key in "kpd"
+    )
     try:
         model = lens_model(None if rectified or not np.any(distortion) else info.distortion_model)
     except DataError as error:
@@ -223,8 +254,14 @@ def camera_file_of(
     fx, _, cx, *_ = P if rectified else K
     fy, cy = (P[5], P[6]) if rectified else (K[4], K[5])
     if not (fx > 0 and fy > 0):
-        raise SequenceError(f"{where} has no calibration, its focal length is {fx:g}: give --camera")
-    width, height, roi = info.width or (size or (0, 0))[0], info.height or (size or (0, 0))[1], info.roi
+        raise SequenceError(
+            f"{where} has no calibration, its focal length is {fx:g}: give --camera"
+        )
+    width, height, roi = (
+        info.width or (size or (0, 0))[0],
+        info.height or (size or (0, 0))[1],
+        info.roi,
+    )
     if size != (width, height):
         binning_x, binning_y = max(info.binning_x, 1), max(info.binning_y, 1)
         if roi.width and roi.height:
@@ -234,7 +271,9 @@ def camera_file_of(
         cx = (cx - roi.x_offset + 0.5) / binning_x - 0.5
         cy = (cy - roi.y_offset + 0.5) / binning_y - 0.5
     coefficients = [] if model == "pinhole" else [float(value) for value in distortion]
-    keys = pinhole_keys(width, height, fx, fy, cx, cy, fps=fps, model=model, distortion=coefficients)
+    keys = pinhole_keys(
+        width, height, fx, fy, cx, cy, fps=fps, model=model, distortion=coefficients
+    )
     return camera_of(keys, where)
 
 
@@ -252,8 +291,13 @@ def points_of(cloud: Any, where: str) -> FloatArray:
     data: NDArray[np.uint8] = np.asarray(cloud.data, dtype=np.uint8)
     if len(data) < count * step:
         raise DataError(f"{where} has {len(data)} bytes for {count} points of {step}")
-    formats, places = [f"{'>' if cloud.is_bigendian else '<'}f4"] * 3, [offsets[axis] for axis in "xyz"]
-    layout = np.dtype({"names": list("xyz"), "formats": formats, "offsets": places, "itemsize": step})
+    formats, places = (
+        [f"{'>' if cloud.is_bigendian else '<'}f4"] * 3,
+        [offsets[axis] for axis in "xyz"],
+    )
+    layout = np.dtype(
+        {"names": list("xyz"), "formats": formats, "offsets": places, "itemsize": step}
+    )
     table = np.frombuffer(data[: count * step].tobytes(), layout)
     points = np.column_stack([table[axis].astype(np.float64) for axis in "xyz"])
     return points[np.isfinite(points).all(axis=1)]

@@ -37,7 +37,9 @@ Keys = dict[str, Any]
 
 # names of a lens by other programs, and the model of camera.yaml
 LENSES: dict[str | None, Literal["pinhole", "opencv", "fisheye"]] = {
-    **dict.fromkeys(("plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "PinHole"), "opencv"),
+    **dict.fromkeys(
+        ("plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "PinHole"), "opencv"
+    ),
     **dict.fromkeys(("equidistant", "fisheye", "KannalaBrandt8"), "fisheye"),
     **dict.fromkeys(("none", "None", "", None, "Rectified"), "pinhole"),
 }
@@ -81,7 +83,9 @@ def find_camera_file(
     camera = None if own is None else own()
     found = beside(*folders, own=None if camera is None else camera.model_dump())
     if camera is not None and found is not None:
-        return camera.model_copy(update={"camera_height_m": found.camera_height_m, "readout_ms": found.readout_ms})
+        return camera.model_copy(
+            update={"camera_height_m": found.camera_height_m, "readout_ms": found.readout_ms}
+        )
     camera = camera or found
     if camera is not None:
         return camera
@@ -109,10 +113,16 @@ def explicit_camera(given: Path, images: Sized, fps: float | None = None) -> Cam
             f"{given} is no field of view: write fov=70 for 70 degrees from the left edge of the image to the "
             f"right, {least:g} to {most:g}, or fov=70,fps=30 for 30 frames a second as well"
         )
-    width, height, source = images.width, images.height, f"a horizontal field of view of {fov_deg:g} degrees"
+    width, height, source = (
+        images.width,
+        images.height,
+        f"a horizontal field of view of {fov_deg:g} degrees",
+    )
     focal_px = width / 2 / math.tan(math.radians(fov_deg) / 2)
     centre = (width - 1) / 2, (height - 1) / 2
-    return camera_of(pinhole_keys(width, height, focal_px, focal_px, *centre, fps=fps, source=source), str(given))
+    return camera_of(
+        pinhole_keys(width, height, focal_px, focal_px, *centre, fps=fps, source=source), str(given)
+    )
 
 
 def read_explicit(path: Path, fps: float | None = None) -> CameraFile:
@@ -124,7 +134,9 @@ def read_explicit(path: Path, fps: float | None = None) -> CameraFile:
 
 def beside(*folders: Path, own: Mapping[str, Any] | None = None) -> CameraFile | None:
     """The first ``camera.yaml`` found in ``folders``, or None; keys that it lacks are those of the ``own`` camera."""
-    path = next((folder / CAMERA_FILE for folder in folders if (folder / CAMERA_FILE).exists()), None)
+    path = next(
+        (folder / CAMERA_FILE for folder in folders if (folder / CAMERA_FILE).exists()), None
+    )
     return None if path is None else read_camera_file(path, own)
 
 
@@ -150,7 +162,9 @@ def _read_foreign(path: Path, fps: float) -> CameraFile | None:
     program = "COLMAP"
     keys_of: Callable[[Any], Keys] = _colmap
     if path.suffix != ".txt":
-        mark = next((mark for mark in _PROGRAMS if isinstance(content, dict) and mark in content), None)
+        mark = next(
+            (mark for mark in _PROGRAMS if isinstance(content, dict) and mark in content), None
+        )
         if mark is None:
             return None
         program, keys_of = _PROGRAMS[mark]
@@ -162,19 +176,25 @@ def _read_foreign(path: Path, fps: float) -> CameraFile | None:
             keys["distortion"] = []
         return camera_of({"fps": fps, **keys, "source": f"a calibration of {program}"}, str(path))
     except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise DataError(f"{path} looks like a calibration of {program}, but lacks {error}") from error
+        raise DataError(
+            f"{path} looks like a calibration of {program}, but lacks {error}"
+        ) from error
 
 
 def read_opencv_yaml(path: Path) -> Any:
     """The content of a YAML file that OpenCV may have written, whose first line and tags are none of YAML."""
     text = read_text(path)
-    return parse_yaml(text.partition("\n")[2].replace("!!opencv-matrix", "") if text.startswith("%") else text)
+    return parse_yaml(
+        text.partition("\n")[2].replace("!!opencv-matrix", "") if text.startswith("%") else text
+    )
 
 
 def lens_model(name: str | None) -> Literal["pinhole", "opencv", "fisheye"]:
     """The model of ``camera.yaml`` of a lens as another program names it; ``DataError`` where it is unknown."""
     if name not in LENSES:
-        raise DataError(f"the lens model {name} is unknown: known are {', '.join(filter(None, LENSES))}; give --camera")
+        raise DataError(
+            f"the lens model {name} is unknown: known are {', '.join(filter(None, LENSES))}; give --camera"
+        )
     return LENSES[name]
 
 
@@ -186,7 +206,9 @@ def pinhole_keys(width: Any, height: Any, fx: Any, fy: Any, cx: Any, cy: Any, **
 def _kalibr(camera: Keys) -> Keys:
     """Of Kalibr's ``cam0`` or EuRoC's ``sensor.yaml``."""
     if camera.get("camera_model", "pinhole") != "pinhole":
-        raise DataError(f"the camera_model {camera['camera_model']} is unknown: calibrate as pinhole")
+        raise DataError(
+            f"the camera_model {camera['camera_model']} is unknown: calibrate as pinhole"
+        )
     distortion = camera.get("distortion_coeffs", camera.get("distortion_coefficients", []))
     keys = pinhole_keys(*camera["resolution"], *camera["intrinsics"], distortion=distortion)
     rate = {"fps": camera["rate_hz"]} if "rate_hz" in camera else {}
@@ -207,7 +229,11 @@ def _orb_slam(content: Keys) -> Keys:
     names = ("k1", "k2", "k3", "k4") if model == "fisheye" else ("k1", "k2", "p1", "p2", "k3")
     keys = pinhole_keys(content["Camera.width"], content["Camera.height"], *focal)
     keys |= {"fps": content["Camera.fps"]} if "Camera.fps" in content else {}
-    return {**keys, "model": model, "distortion": [content.get(f"{prefix}.{name}", 0.0) for name in names]}
+    return {
+        **keys,
+        "model": model,
+        "distortion": [content.get(f"{prefix}.{name}", 0.0) for name in names],
+    }
 
 
 def _colmap(text: str) -> Keys:
@@ -216,12 +242,16 @@ def _colmap(text: str) -> Keys:
     try:
         _, name, width, height, *words = rows[0]
         if name not in _COLMAP:
-            raise DataError(f"COLMAP's camera model {name} is unknown: known are {', '.join(_COLMAP)}")
+            raise DataError(
+                f"COLMAP's camera model {name} is unknown: known are {', '.join(_COLMAP)}"
+            )
         places, coefficients, model = _COLMAP[name]
         values = [*map(float, words), 0.0]
         fx, fy, cx, cy = (values[place] for place in places)
         distortion = [values[place] for place in coefficients]
-        return pinhole_keys(int(width), int(height), fx, fy, cx - 0.5, cy - 0.5, model=model, distortion=distortion)
+        return pinhole_keys(
+            int(width), int(height), fx, fy, cx - 0.5, cy - 0.5, model=model, distortion=distortion
+        )
     except (IndexError, ValueError) as error:
         raise ValueError("a row 'CAMERA_ID MODEL WIDTH HEIGHT PARAMS...'") from error
 
@@ -256,10 +286,20 @@ class Undistortion:
         focal = zoom * camera.fx, zoom * camera.fy
         readout_s = camera.readout_ms / 1e3
         self.intrinsics = Intrinsics(
-            camera.width, camera.height, *focal, camera.cx, camera.cy, undistorted=True, readout_s=readout_s
+            camera.width,
+            camera.height,
+            *focal,
+            camera.cx,
+            camera.cy,
+            undistorted=True,
+            readout_s=readout_s,
         )
         pixels = self.intrinsics.pixel_grid()
-        seen = self.distort(pixels.reshape(-1, 2), self.intrinsics.K).astype(np.float32).reshape(pixels.shape)
+        seen = (
+            self.distort(pixels.reshape(-1, 2), self.intrinsics.K)
+            .astype(np.float32)
+            .reshape(pixels.shape)
+        )
         self._maps = np.ascontiguousarray(seen[..., 0]), np.ascontiguousarray(seen[..., 1])
 
     def apply(self, image: Image) -> Image:
@@ -270,7 +310,10 @@ class Undistortion:
                 f"the image is {width}x{height}, its camera {camera.width}x{camera.height}: "
                 "give the calibration of this camera at this size"
             )
-        return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+        return np.asarray(
+            cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
+            np.uint8,
+        )
 
     def apply_to_depth(self, depth: DepthMap) -> DepthMap:
         """Undistort z-depth ``(H, W)`` of an image, not positive or not finite where unknown."""
@@ -285,7 +328,9 @@ class Undistortion:
             distorted = cv2.fisheye.distortPoints(rays[:, None], self._K, self._coefficients)
         else:
             points = np.column_stack([rays, np.ones(len(rays))])
-            distorted, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), self._K, self._coefficients)
+            distorted, _ = cv2.projectPoints(
+                points, np.zeros(3), np.zeros(3), self._K, self._coefficients
+            )
         return np.asarray(distorted, dtype=np.float64).reshape(-1, 2)
 
     def _bend(self, rays: FloatArray) -> FloatArray:
@@ -326,7 +371,9 @@ def require_size(images: Sized, camera: CameraFile, where: str) -> None:
         wanted = "they are turned by a quarter, perhaps by their own metadata: turn them back"
     else:
         scaled = camera.pinhole.resized(images.width, images.height)
-        values = ", ".join(f"{name}: {getattr(scaled, name):.6g}" for name in ("fx", "fy", "cx", "cy"))
+        values = ", ".join(
+            f"{name}: {getattr(scaled, name):.6g}" for name in ("fx", "fy", "cx", "cy")
+        )
         keys = f"width: {images.width}, height: {images.height}, {values}"
         wanted = f"resize the images, or if they were only resized, scale the file to {{{keys}}}"
     raise SequenceError(

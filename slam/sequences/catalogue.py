@@ -52,7 +52,9 @@ _CACHED_FRAMES = 32
 # by kind of recording: names of pieces, the drive they are of, and their number or the time at which they begin
 _PIECES = {
     "video": (
-        re.compile(r"(?P<head>G)(?:[HXLP](?P<number>\d\d)|OPR)(?P<tail>\d{4})"),  # GoPro; the first of old ones is GOPR
+        re.compile(
+            r"(?P<head>G)(?:[HXLP](?P<number>\d\d)|OPR)(?P<tail>\d{4})"
+        ),  # GoPro; the first of old ones is GOPR
         re.compile(
             r"(?P<head>\D*)(?P<date>\d{4}(?:[-_.]?\d\d){2})[-_ T]*(?P<clock>\d\d(?:[-_.]?\d\d){2})"
             r"(?:[-_]\d+)?(?P<tail>\D*)"
@@ -143,10 +145,15 @@ def _parts(root: Path, asked: Asked) -> dict[str, tuple[str, Opener]]:
     found = _recognised(root, asked)
     if found or root.is_file():
         return found
-    for child in sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith(".")):
+    for child in sorted(
+        path for path in root.iterdir() if path.is_dir() and not path.name.startswith(".")
+    ):
         with suppress(DataError, SequenceError):  # a folder that is refused when it is given
             inside = _recognised(child, Asked(None, asked.camera))
-            found |= {child.name if len(inside) == 1 else f"{child.name}/{name}": inside[name] for name in inside}
+            found |= {
+                child.name if len(inside) == 1 else f"{child.name}/{name}": inside[name]
+                for name in inside
+            }
     return found
 
 
@@ -165,14 +172,21 @@ def _recognised(root: Path, asked: Asked) -> dict[str, tuple[str, Opener]]:
 def _choose(root: Path, asked: Asked) -> RecordedSequence:
     """Open the sequence by its name, or the only one."""
     contents, name = _contents(root, asked), asked.name
-    if name is not None and name not in contents and not Path(name).is_absolute() and (root / name).exists():
+    if (
+        name is not None
+        and name not in contents
+        and not Path(name).is_absolute()
+        and (root / name).exists()
+    ):
         return _choose(root / name, Asked(None, asked.camera))
     if not contents:
         raise SequenceError(_unknown(root))
     found = ", ".join(contents)
     if name is None:
         if len(contents) > 1:
-            raise SequenceError(f"{root} has {len(contents)} sequences: {found}; choose one with --sequence")
+            raise SequenceError(
+                f"{root} has {len(contents)} sequences: {found}; choose one with --sequence"
+            )
         (name,) = contents
     name = drive_name(name) if drive_name(name) in contents else name
     if name not in contents:
@@ -212,10 +226,17 @@ class SimulatedSequence(RecordedSequence):
 
     def __init__(self, options: SimulationOptions, name: str = "sim") -> None:
         street = self.street = simulated_world(options)
-        rendered = functools.lru_cache(maxsize=_CACHED_FRAMES)(lambda index: street.render(index).image)
+        rendered = functools.lru_cache(maxsize=_CACHED_FRAMES)(
+            lambda index: street.render(index).image
+        )
         super().__init__(
             name,
-            ReadImages(options.width, options.height, options.frames, lambda index: np.array(rendered(index))),
+            ReadImages(
+                options.width,
+                options.height,
+                options.frames,
+                lambda index: np.array(rendered(index)),
+            ),
             street.camera,
             uniform_stamps(options.frames, options.rate),
             (Source(f"simulated/{options.seed}", first=None),),
@@ -245,7 +266,9 @@ class Piece(NamedTuple):
                 if "date" not in found:
                     return cls(name, drive, int(found["number"] or 0), False)
                 with suppress(ValueError):  # no date
-                    time = datetime.strptime(re.sub(r"\D", "", found["date"] + found["clock"]), "%Y%m%d%H%M%S")
+                    time = datetime.strptime(
+                        re.sub(r"\D", "", found["date"] + found["clock"]), "%Y%m%d%H%M%S"
+                    )
                     return cls(name, drive, time.timestamp(), True)
         return None
 
@@ -262,7 +285,11 @@ def find_series(kinds: Mapping[str, str]) -> list[list[Piece]]:
             continue
         pieces.sort(key=lambda piece: piece.place)
         apart = np.diff([piece.place for piece in pieces])
-        cuts = [0, *(np.flatnonzero(apart > _LONGEST_PAUSE * np.median(apart)) + 1).tolist(), len(pieces)]
+        cuts = [
+            0,
+            *(np.flatnonzero(apart > _LONGEST_PAUSE * np.median(apart)) + 1).tolist(),
+            len(pieces),
+        ]
         found += [pieces[a:b] for a, b in pairwise(cuts) if b > a + 1]
     return found
 
@@ -277,14 +304,19 @@ def open_series(pieces: Sequence[Piece], openers: Sequence[Opener]) -> RecordedS
     first = parts[0]
     other = next((part for part in parts if part.intrinsics != first.intrinsics), None)
     if other is not None:
-        raise SequenceError(f"{other.name} is of another camera than {first.name}: give one of the files as --dataset")
+        raise SequenceError(
+            f"{other.name} is of another camera than {first.name}: give one of the files as --dataset"
+        )
     logger.info(
         "%s are taken as one recording; give one of the files as --dataset for that alone",
         ", ".join(piece.name for piece in pieces),
     )
     ends = np.cumsum([len(part) for part in parts])
     starts = [0, *ends[:-1].tolist()]
-    poses = [np.full((len(part), 4, 4), np.nan) if part.T_any_camera is None else part.T_any_camera for part in parts]
+    poses = [
+        np.full((len(part), 4, 4), np.nan) if part.T_any_camera is None else part.T_any_camera
+        for part in parts
+    ]
 
     def read(index: int) -> Image:
         place = int(np.searchsorted(ends, index, side="right"))
@@ -296,14 +328,20 @@ def open_series(pieces: Sequence[Piece], openers: Sequence[Opener]) -> RecordedS
         camera=first.camera,
         stamps=_stamps(pieces, [part.stamps for part in parts]),
         sources=tuple(
-            replace(source, first=(source.first or 0) - start, length=(source.first or 0) + len(part))
+            replace(
+                source, first=(source.first or 0) - start, length=(source.first or 0) + len(part)
+            )
             for start, part in zip(starts, parts)
             for source in part.sources
         ),
-        T_any_camera=np.concatenate(poses) if any(part.T_any_camera is not None for part in parts) else None,
+        T_any_camera=np.concatenate(poses)
+        if any(part.T_any_camera is not None for part in parts)
+        else None,
         usual_height_m=first.camera_height_m,
         T_camera_lidar=first.T_camera_lidar,
-        scans={start + k: scan for start, part in zip(starts, parts) for k, scan in part.scans.items()},
+        scans={
+            start + k: scan for start, part in zip(starts, parts) for k, scan in part.scans.items()
+        },
     )
 
 
@@ -312,12 +350,18 @@ def _stamps(pieces: Sequence[Piece], stamps: Sequence[FloatArray]) -> FloatArray
     tick_s = _tick_s(pieces, max(float(np.ptp(each)) for each in stamps))
     joined = [stamps[0]]
     for before, piece, each in zip(pieces, pieces[1:], stamps[1:]):
-        last, length_s, apart = joined[-1][-1], np.ptp(joined[-1]) + period, piece.place - before.place
+        last, length_s, apart = (
+            joined[-1][-1],
+            np.ptp(joined[-1]) + period,
+            piece.place - before.place,
+        )
         start = last + period
         if last < each[0] < last + _LONGEST_PAUSE * length_s:
             start = each[0]
         elif piece.drive[0] == "ROS bag":
-            raise SequenceError(f"{piece.name} does not go on where the bag before it ends: give one alone")
+            raise SequenceError(
+                f"{piece.name} does not go on where the bag before it ends: give one alone"
+            )
         elif piece.is_time and tick_s is None:
             named = joined[-1][0] + apart
             start = named if named > start + _NAMED_TO_S else start
@@ -336,5 +380,7 @@ def _tick_s(pieces: Sequence[Piece], longest_s: float) -> float | None:
     is_regular = (apart < tick_s + _NAMED_TO_S).sum() > 1
     if not (pieces[0].is_time and is_regular and tick_s > _LONGEST_PAUSE * longest_s):
         return None
-    logger.warning("clips of %.1f s are named %.0f s apart: taken as following each other", longest_s, tick_s)
+    logger.warning(
+        "clips of %.1f s are named %.0f s apart: taken as following each other", longest_s, tick_s
+    )
     return tick_s

@@ -31,7 +31,14 @@ from slam.sequences.camera_file import DEFAULT_FPS, find_camera_file
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import poses_near
-from slam.sequences.recording import ArrayReader, RecordedSequence, Source, read_stamps, require_stamps, uniform_stamps
+from slam.sequences.recording import (
+    ArrayReader,
+    RecordedSequence,
+    Source,
+    read_stamps,
+    require_stamps,
+    uniform_stamps,
+)
 from slam.simulation.world import distances, scene_of
 
 logger = logging.getLogger(__name__)
@@ -56,19 +63,27 @@ def _open_odometry(root: OdometryRoot, name: str, asked: Path | None) -> Recorde
     T_camera_cam0 = calibration.T_camera_cam0(f"P{number}")
     simulated = root.simulation_seed()
     key = next((key for key in ("Tr", "Tr_velo_to_cam") if key in calibration), None)
-    T_cam0_lidar = None if key is None else np.vstack([calibration.matrix(key, (3, 4)), [0.0, 0.0, 0.0, 1.0]])
+    T_cam0_lidar = (
+        None if key is None else np.vstack([calibration.matrix(key, (3, 4)), [0.0, 0.0, 0.0, 1.0]])
+    )
     return RecordedSequence(
         name=name,
         images=stored,
         camera=_camera(calibration.pinhole, f"P{number}", stored, asked, root.base),
         stamps=stamps,
-        sources=(Source(root.recording_name(name), first=files.first if simulated is None else None),),
-        T_any_camera=_odometry_poses(root.base / "poses" / f"{name}.txt", files, stamps, T_camera_cam0),
+        sources=(
+            Source(root.recording_name(name), first=files.first if simulated is None else None),
+        ),
+        T_any_camera=_odometry_poses(
+            root.base / "poses" / f"{name}.txt", files, stamps, T_camera_cam0
+        ),
         usual_height_m=kitti.CAMERA_HEIGHT_M if simulated is None or asked is not None else None,
         T_camera_lidar=None if T_cam0_lidar is None else T_camera_cam0 @ T_cam0_lidar,
         scans=_readers(kitti.read_velodyne, folder / "velodyne", "*.bin", files),
         depth_maps=_readers(read_depth_map, folder / f"depth_{number}", "*.png", files),
-        distance_to_surface=None if simulated is None else _distance_to_mesh(root.base / "mesh.ply"),
+        distance_to_surface=None
+        if simulated is None
+        else _distance_to_mesh(root.base / "mesh.ply"),
     )
 
 
@@ -78,7 +93,9 @@ def _open_raw(drive: Path, asked: Path | None) -> RecordedSequence:
     number = next((c for c in kitti.RAW_CAMERAS if has_images(drive / f"image_{c}" / "data")), None)
     if number is None:
         looked = ", ".join(f"image_{c}/data" for c in kitti.RAW_CAMERAS)
-        raise SequenceError(f"no images in {drive}: looked for png or jpg in {looked}; copy the drive again")
+        raise SequenceError(
+            f"no images in {drive}: looked for png or jpg in {looked}; copy the drive again"
+        )
     stored = ImageFiles(by_number(list_images(drive / f"image_{number}" / "data")))
     files, times = stored.files, drive / f"image_{number}" / "timestamps.txt"
     cameras = CalibrationFile(drive.parent / kitti.CAM_TO_CAM)
@@ -97,12 +114,18 @@ def _open_raw(drive: Path, asked: Path | None) -> RecordedSequence:
         usual_height_m=kitti.CAMERA_HEIGHT_M,
         T_camera_lidar=T_camera_lidar,
         scans=_readers(kitti.read_velodyne, drive / "velodyne_points/data", "*.bin", files),
-        depth_maps=_readers(read_depth_map, drive / _DEPTH_MAPS / f"image_{number}", "*.png", files),
+        depth_maps=_readers(
+            read_depth_map, drive / _DEPTH_MAPS / f"image_{number}", "*.png", files
+        ),
     )
 
 
 def _camera(
-    pinhole: Callable[[str, int, int], Pinhole], key: str, stored: ImageFiles, asked: Path | None, *places: Path
+    pinhole: Callable[[str, int, int], Pinhole],
+    key: str,
+    stored: ImageFiles,
+    asked: Path | None,
+    *places: Path,
 ) -> CameraFile:
     def own() -> CameraFile:
         return CameraFile(**asdict(pinhole(key, stored.width, stored.height)), fps=DEFAULT_FPS)
@@ -158,7 +181,9 @@ def _T_camera_lidar(drive: Path, cameras: CalibrationFile, number: str) -> Float
         return None
     T_rect0_cam0 = se3.make(cameras.matrix("R_rect_00", (3, 3)), np.zeros(3))
     T_cam0_lidar = CalibrationFile(path).transform("R", "T")
-    T_camera_lidar: FloatArray = cameras.T_camera_cam0(f"P_rect_{number}") @ T_rect0_cam0 @ T_cam0_lidar
+    T_camera_lidar: FloatArray = (
+        cameras.T_camera_cam0(f"P_rect_{number}") @ T_rect0_cam0 @ T_cam0_lidar
+    )
     return T_camera_lidar
 
 
@@ -179,7 +204,11 @@ def _oxts_poses(
     found = sorted(folder.glob("*.txt"))
     packets = by_number(found) if found else None
     paths = {int(path.stem): path for path in found}
-    rows = range(len(files)) if all(files.first + row in paths for row in range(len(files))) else files.rows
+    rows = (
+        range(len(files))
+        if all(files.first + row in paths for row in range(len(files)))
+        else files.rows
+    )
     if packets is None or not all(files.first + row in paths for row in rows):
         raise SequenceError(
             f"{folder} has {len(paths)} packets for {len(files.paths)} images: restore what is missing, or remove "
@@ -209,7 +238,11 @@ def T_world_imu(packets: FloatArray, ages_s: FloatArray) -> FloatArray:
             after it; the pose is extrapolated to the image with the packet's velocity and angular rate.
             Packets and images differ by up to 14 ms, which at 40 km/h is 15 cm.
     """
-    latitude, longitude, altitude = np.deg2rad(packets[:, 0]), np.deg2rad(packets[:, 1]), packets[:, 2]
+    latitude, longitude, altitude = (
+        np.deg2rad(packets[:, 0]),
+        np.deg2rad(packets[:, 1]),
+        packets[:, 2],
+    )
     scale = np.cos(latitude[0])
     east = scale * _EARTH_RADIUS_M * longitude
     north = scale * _EARTH_RADIUS_M * np.log(np.tan(np.pi / 4 + latitude / 2))
@@ -251,7 +284,11 @@ def _find_odometry(path: Path, asked: Asked) -> dict[str, Opener]:
     root = kitti.find_odometry_root(path)
     if root is not None:
         names = root.names()
-        if asked.name is not None and asked.name not in names and (root.sequences / asked.name).is_dir():
+        if (
+            asked.name is not None
+            and asked.name not in names
+            and (root.sequences / asked.name).is_dir()
+        ):
             names.append(asked.name)  # for the error about what it lacks
         return {name: partial(_open_odometry, root, name, asked.camera) for name in names}
     where = path.absolute()
@@ -262,7 +299,10 @@ def _find_odometry(path: Path, asked: Asked) -> dict[str, Opener]:
 
 
 def _find_raw(path: Path, asked: Asked) -> dict[str, Opener]:
-    return {name: partial(_open_raw, drive, asked.camera) for name, drive in kitti.find_drives(path).items()}
+    return {
+        name: partial(_open_raw, drive, asked.camera)
+        for name, drive in kitti.find_drives(path).items()
+    }
 
 
 LOADERS = (

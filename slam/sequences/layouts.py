@@ -23,15 +23,34 @@ from erfsfm.common.readers.camera_file import CameraFile, camera_of
 from erfsfm.common.readers.images import first_size, has_images, list_images, read_depth_map
 from erfsfm.common.readers.kitti import read_velodyne
 from erfsfm.common.readers.numbering import NumberedFiles, by_name, by_table
-from slam.formats.trajectory import BadRows, in_seconds, nearest_stamps, number_or_nan, read_trajectory, rows_of
+from slam.formats.trajectory import (
+    BadRows,
+    in_seconds,
+    nearest_stamps,
+    number_or_nan,
+    read_trajectory,
+    rows_of,
+)
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
-from slam.sequences.camera_file import beside, find_camera_file, pinhole_keys, read_explicit, read_opencv_yaml
+from slam.sequences.camera_file import (
+    beside,
+    find_camera_file,
+    pinhole_keys,
+    read_explicit,
+    read_opencv_yaml,
+)
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import pose_files, poses_near, poses_of, read_matrix
-from slam.sequences.recording import ArrayReader, RecordedSequence, Source, read_stamps, require_stamps
+from slam.sequences.recording import (
+    ArrayReader,
+    RecordedSequence,
+    Source,
+    read_stamps,
+    require_stamps,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -68,12 +87,16 @@ def _recorded(
     ``places`` may have a ``camera.yaml``; ``own`` reads the calibration of the data set.
     """
     stored = ImageFiles(files)
-    camera = find_camera_file(asked, *places, wanted_by=f"{name} in {places[0]}", images=stored, own=own)
+    camera = find_camera_file(
+        asked, *places, wanted_by=f"{name} in {places[0]}", images=stored, own=own
+    )
     sources = (Source(f"{data_set}/{name}", first=first),)
     return RecordedSequence(name, stored, camera, stamps, sources, **known)
 
 
-def _index(table: Path, folder: Path, in_nanoseconds: bool = False) -> tuple[FloatArray, list[Path]]:
+def _index(
+    table: Path, folder: Path, in_nanoseconds: bool = False
+) -> tuple[FloatArray, list[Path]]:
     """Stamps in seconds and files, which are in ``folder``, of a table of both, good rows in the order of time."""
     wanted = "'nanoseconds,file'" if in_nanoseconds else "'stamp file'"
     bad, numbers, stamps, files = BadRows(table, SequenceError), [], [], []
@@ -87,13 +110,19 @@ def _index(table: Path, folder: Path, in_nanoseconds: bool = False) -> tuple[Flo
             files.append(folder / words[1])
         else:
             bad.add(number, f"{line!r} is not {wanted}")
-    order = bad.in_order(np.array(stamps), "stamps", np.array(numbers, np.intp), f"rows of {wanted}")
+    order = bad.in_order(
+        np.array(stamps), "stamps", np.array(numbers, np.intp), f"rows of {wanted}"
+    )
     return np.array(stamps)[order], [files[k] for k in order]
 
 
 def _depth_maps(paths: list[Path], unknown: int = 0) -> dict[int, ArrayReader]:
     """In millimetres, of the frames whose files are there."""
-    return {k: partial(read_depth_map, path, 1000.0, unknown) for k, path in enumerate(paths) if path.is_file()}
+    return {
+        k: partial(read_depth_map, path, 1000.0, unknown)
+        for k, path in enumerate(paths)
+        if path.is_file()
+    }
 
 
 def _truth(path: Path, stamps: FloatArray) -> FloatArray | None:
@@ -112,7 +141,11 @@ def _find_euroc(path: Path, asked: Asked) -> dict[str, Opener]:
     path = path.absolute()
     cameras = (body / name for body in (path / "mav0", path) for name in _EUROC_CAMERAS)
     camera = next((camera for camera in cameras if (camera / "data.csv").is_file()), None)
-    return {} if camera is None else {camera.parents[1].name: partial(_open_euroc, camera, asked.camera)}
+    return (
+        {}
+        if camera is None
+        else {camera.parents[1].name: partial(_open_euroc, camera, asked.camera)}
+    )
 
 
 def _open_euroc(camera: Path, asked: Path | None) -> RecordedSequence:
@@ -124,19 +157,28 @@ def _open_euroc(camera: Path, asked: Path | None) -> RecordedSequence:
     truth = _euroc_truth(body, stamps, sensor)
     places = body, body.parent
     own = partial(read_explicit, sensor)
-    return _recorded("euroc", body.parent.name, files, stamps, asked, places, own, T_any_camera=truth)
+    return _recorded(
+        "euroc", body.parent.name, files, stamps, asked, places, own, T_any_camera=truth
+    )
 
 
 def _euroc_truth(body: Path, stamps: FloatArray, camera: Path) -> FloatArray | None:
     """``T_any_camera`` at the images' stamps; ``camera`` is the ``sensor.yaml`` that says where the camera sits."""
-    folder = next((body / name for name in _EUROC_TRUTH if (body / name / "data.csv").exists()), None)
+    folder = next(
+        (body / name for name in _EUROC_TRUTH if (body / name / "data.csv").exists()), None
+    )
     if folder is None:
         if (body / _EUROC_POSITIONS).is_dir():
-            logger.warning("%s has true positions without rotations: they are not used", body / _EUROC_POSITIONS)
+            logger.warning(
+                "%s has true positions without rotations: they are not used",
+                body / _EUROC_POSITIONS,
+            )
         return None
     table, sensor = folder / "data.csv", folder / "sensor.yaml"
     if not camera.exists():
-        logger.warning("%s is not used: %s, which says where the camera sits, is missing", table, camera)
+        logger.warning(
+            "%s is not used: %s, which says where the camera sits, is missing", table, camera
+        )
         return None
     truth = read_trajectory(table)
     T_body_sensor = _T_body_sensor(sensor) if sensor.exists() else np.eye(4)
@@ -147,11 +189,15 @@ def _euroc_truth(body: Path, stamps: FloatArray, camera: Path) -> FloatArray | N
 def _T_body_sensor(path: Path) -> FloatArray:
     """The pose of a sensor in the body ``(4, 4)`` by its ``sensor.yaml``."""
     try:
-        T_body_sensor = np.array(read_opencv_yaml(path)["T_BS"]["data"], dtype=np.float64).reshape(4, 4)
+        T_body_sensor = np.array(read_opencv_yaml(path)["T_BS"]["data"], dtype=np.float64).reshape(
+            4, 4
+        )
     except (OSError, KeyError, TypeError, ValueError, ErfsfmError) as error:
         raise SequenceError(f"{path} needs T_BS with data of 4 x 4 numbers: {error}") from error
     if not se3.is_se3(T_body_sensor, _RIGID_TOLERANCE):
-        raise SequenceError(f"{path} has a T_BS that is no rotation and translation: restore the file")
+        raise SequenceError(
+            f"{path} has a T_BS that is no rotation and translation: restore the file"
+        )
     return T_body_sensor
 
 
@@ -186,13 +232,26 @@ def _open_tum(folder: Path, asked: Path | None) -> RecordedSequence:
         near = _near(stamps, known, _NEAR_DEPTH_S)
         depth_maps = {k: partial(read_depth_map, paths[row], _TUM_PER_METRE) for k, row in near}
     truth = _truth(folder / "groundtruth.txt", stamps)
-    return _recorded("tum", folder.name, files, stamps, asked, places, own, T_any_camera=truth, depth_maps=depth_maps)
+    return _recorded(
+        "tum",
+        folder.name,
+        files,
+        stamps,
+        asked,
+        places,
+        own,
+        T_any_camera=truth,
+        depth_maps=depth_maps,
+    )
 
 
 def _near(stamps: FloatArray, known: FloatArray, within_s: float) -> list[tuple[int, int]]:
     """Frames, each with the nearest row of others if that is within so many seconds."""
     nearest = nearest_stamps(stamps, known)
-    return [(int(k), int(nearest[k])) for k in np.flatnonzero(np.abs(known[nearest] - stamps) <= within_s)]
+    return [
+        (int(k), int(nearest[k]))
+        for k in np.flatnonzero(np.abs(known[nearest] - stamps) <= within_s)
+    ]
 
 
 # TUM mono: images/, times.txt and camera.txt with the FOV lens; true poses of the start and the end alone
@@ -207,7 +266,9 @@ def _open_tum_mono(folder: Path, asked: Path | None) -> RecordedSequence:
     fps = 1.0 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
     truth = _truth(folder / "groundtruthSync.txt", stamps)
     own = partial(_fov_camera, folder / "camera.txt", fps)
-    return _recorded("tum_mono", folder.name, files, stamps, asked, [folder], own, T_any_camera=truth)
+    return _recorded(
+        "tum_mono", folder.name, files, stamps, asked, [folder], own, T_any_camera=truth
+    )
 
 
 def _fov_camera(path: Path, fps: float) -> CameraFile:
@@ -231,17 +292,25 @@ def _fov_camera(path: Path, fps: float) -> CameraFile:
 
 def _open_seven_scenes(folder: Path, asked: Path | None) -> RecordedSequence:
     """With the camera that the data set publishes for all."""
-    numbers = sorted(int(match[1]) for path in folder.iterdir() if (match := _SEVEN_SCENES_IMAGE.fullmatch(path.name)))
+    numbers = sorted(
+        int(match[1])
+        for path in folder.iterdir()
+        if (match := _SEVEN_SCENES_IMAGE.fullmatch(path.name))
+    )
     if not numbers:
         raise SequenceError(f"no frame-NNNNNN.color.png in {folder}: unpack the sequence")
     frames = [folder / f"frame-{k:06d}" for k in range(numbers[0], numbers[-1] + 1)]
     files = by_table([frame.with_suffix(".color.png") for frame in frames], folder)
     stamps = np.arange(numbers[0], numbers[-1] + 1) / _FPS
     name, places = f"{folder.parent.name}_{folder.name}", (folder, folder.parent)
-    own = partial(CameraFile, width=640, height=480, fx=585.0, fy=585.0, cx=320.0, cy=240.0, fps=_FPS)
+    own = partial(
+        CameraFile, width=640, height=480, fx=585.0, fy=585.0, cx=320.0, cy=240.0, fps=_FPS
+    )
     known = {
         "T_any_camera": pose_files([frame.with_suffix(".pose.txt") for frame in frames], stamps),
-        "depth_maps": _depth_maps([frame.with_suffix(".depth.png") for frame in frames], _SEVEN_SCENES_UNKNOWN),
+        "depth_maps": _depth_maps(
+            [frame.with_suffix(".depth.png") for frame in frames], _SEVEN_SCENES_UNKNOWN
+        ),
     }
     return _recorded("7scenes", name, files, stamps, asked, places, own, numbers[0], **known)
 
@@ -264,7 +333,9 @@ def _open_scannet(folder: Path, asked: Path | None) -> RecordedSequence:
         "T_any_camera": pose_files([folder / "pose" / f"{k}.txt" for k in numbers], stamps),
         "depth_maps": _depth_maps([folder / "depth" / f"{k}.png" for k in numbers]),
     }
-    return _recorded("scannet", folder.name, files, stamps, asked, [folder], own, numbers[0], **known)
+    return _recorded(
+        "scannet", folder.name, files, stamps, asked, [folder], own, numbers[0], **known
+    )
 
 
 _SCANNET_CAMERA = "intrinsic/intrinsic_color.txt"
@@ -272,7 +343,9 @@ _SCANNET_CAMERA = "intrinsic/intrinsic_color.txt"
 
 def _scannet_camera(path: Path, files: NumberedFiles) -> CameraFile:
     K, (height, width) = read_matrix(path, "a camera"), first_size(files.paths)
-    return camera_of(pinhole_keys(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], fps=_FPS), str(path))
+    return camera_of(
+        pinhole_keys(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], fps=_FPS), str(path)
+    )
 
 
 # nuScenes: the tables v1.0-*/scene.json and others, with microseconds
@@ -289,7 +362,9 @@ def _open_nuscenes(root: Path, tables: Path, scene: str, asked: Path | None) -> 
         shown = front[files.first :][: len(files)]
         mount = mounts[front[0]["calibrated_sensor_token"]]
         (T_ego_camera,) = _nuscenes_poses([mount])
-        T_any_camera = _nuscenes_poses([ego_poses[row["ego_pose_token"]] for row in shown]) @ T_ego_camera
+        T_any_camera = (
+            _nuscenes_poses([ego_poses[row["ego_pose_token"]] for row in shown]) @ T_ego_camera
+        )
         (fx, _, cx), (_, fy, cy), _ = mount["camera_intrinsic"]
         height_m = float(T_ego_camera[2, 3])
         size = front[0]["width"], front[0]["height"]
@@ -299,10 +374,16 @@ def _open_nuscenes(root: Path, tables: Path, scene: str, asked: Path | None) -> 
         if lidar:
             (T_ego_lidar,) = _nuscenes_poses([mounts[lidar[0]["calibrated_sensor_token"]]])
             T_camera_lidar = se3.invert(T_ego_camera) @ T_ego_lidar
-            paths = {k: root / lidar[row]["filename"] for k, row in _near(stamps, _times(lidar), _NEAR_S)}
-            scans = {k: partial(read_velodyne, path, 5) for k, path in paths.items() if path.exists()}
+            paths = {
+                k: root / lidar[row]["filename"] for k, row in _near(stamps, _times(lidar), _NEAR_S)
+            }
+            scans = {
+                k: partial(read_velodyne, path, 5) for k, path in paths.items() if path.exists()
+            }
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise SequenceError(f"the tables in {tables} are not those of nuScenes: {error!r}; copy them again") from error
+        raise SequenceError(
+            f"the tables in {tables} are not those of nuScenes: {error!r}; copy them again"
+        ) from error
     own = partial(camera_of, keys, str(tables / "calibrated_sensor.json"))
     known = {"T_any_camera": T_any_camera, "T_camera_lidar": T_camera_lidar, "scans": scans}
     return _recorded("nuscenes", scene, files, stamps, asked, [root], own, files.first, **known)
@@ -317,7 +398,9 @@ def _scene(tables: Path, scene: str) -> tuple[dict[str, list[Row]], dict[str, Ro
     rows: dict[str, list[Row]] = {}
     for row in sorted(_table(tables, "sample_data"), key=lambda row: float(row["timestamp"])):
         if row["sample_token"] in samples:
-            rows.setdefault(channels[mounts[row["calibrated_sensor_token"]]["sensor_token"]], []).append(row)
+            rows.setdefault(
+                channels[mounts[row["calibrated_sensor_token"]]["sensor_token"]], []
+            ).append(row)
     return rows, mounts, {row["token"]: row for row in _table(tables, "ego_pose")}
 
 
@@ -365,7 +448,9 @@ def _loader(
 
     def find(path: Path, asked: Asked) -> dict[str, Opener]:
         path = path.absolute()
-        found = [path] if is_one(path) else sorted(filter(is_one, path.glob(inside))) if inside else []
+        found = (
+            [path] if is_one(path) else sorted(filter(is_one, path.glob(inside))) if inside else []
+        )
         return {folder.name: partial(open_one, folder, asked.camera) for folder in found}
 
     return Loader(kind, layout, find)

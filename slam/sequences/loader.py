@@ -16,7 +16,13 @@ import numpy as np
 
 from erfsfm.common.readers.images import image_folder, list_images, recording_folder
 from erfsfm.common.readers.numbering import NumberedFiles, by_name
-from erfsfm.common.readers.video import VIDEO_SUFFIXES, VideoFrames, clip_name, list_videos, video_name
+from erfsfm.common.readers.video import (
+    VIDEO_SUFFIXES,
+    VideoFrames,
+    clip_name,
+    list_videos,
+    video_name,
+)
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import find_camera_file
@@ -66,12 +72,16 @@ def open_folder(folder: Path, asked: Path | None) -> RecordedSequence:
     """Open a folder of images in natural order, at the stamps of its ``times.txt`` or the camera's frame rate."""
     where = image_folder(folder)
     if where is None:
-        raise SequenceError(f"no images in {folder}: looked for png, jpg, bmp there and in its sub-folders")
+        raise SequenceError(
+            f"no images in {folder}: looked for png, jpg, bmp there and in its sub-folders"
+        )
     files = by_name(list_images(where))
     stored = ImageFiles(files)
     places = (where, folder, folder.absolute().parent)
     camera = find_camera_file(asked, *places, wanted_by=f"images in {where}", images=stored)
-    stamps = _times_of_images([place / name for place in (where, folder) for name in TIMES], files, camera.fps)
+    stamps = _times_of_images(
+        [place / name for place in (where, folder) for name in TIMES], files, camera.fps
+    )
     name = recording_folder(folder).name
     return RecordedSequence(name, stored, camera, stamps, (Source(f"folder/{name}"),))
 
@@ -100,8 +110,13 @@ def open_video(path: Path, asked: Path | None) -> RecordedSequence:
     """Open a video, turned as its rotation flag says, at the camera's frame rate or at its own frame times."""
     folder = path.absolute().parent
     frames = VideoFrames(path)
-    camera = find_camera_file(asked, folder, wanted_by=f"video {path}", images=frames, fps=frames.fps)
-    stamps, sources = _times_of_frames(path, frames, camera.fps), (Source(f"folder/{video_name(path)}"),)
+    camera = find_camera_file(
+        asked, folder, wanted_by=f"video {path}", images=frames, fps=frames.fps
+    )
+    stamps, sources = (
+        _times_of_frames(path, frames, camera.fps),
+        (Source(f"folder/{video_name(path)}"),),
+    )
     return RecordedSequence(clip_name(path), frames, camera, stamps, sources)
 
 
@@ -110,7 +125,9 @@ def _times_of_frames(path: Path, frames: VideoFrames, fps: float) -> FloatArray:
     even, times_s = uniform_stamps(len(frames), fps), frames.times_s()
     rates = [frames.fps] if frames.fps else []
     if rates and times_s is not None and len(times_s) > 1:
-        rates.append(1.0 / float(np.median(np.diff(times_s))))  # missing frames lower the mean rate alone
+        rates.append(
+            1.0 / float(np.median(np.diff(times_s)))
+        )  # missing frames lower the mean rate alone
     if rates and all(abs(rate / fps - 1) > _RATE_TOLERANCE for rate in rates):
         text = (
             "%s has %.4g frames a second, the camera has %g: taken as even at the camera's rate; correct fps, unless "

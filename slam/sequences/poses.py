@@ -59,11 +59,15 @@ def poses_of(positions: FloatArray, quaternions_xyzw: FloatArray) -> FloatArray:
     with np.errstate(over="ignore"):
         lengths = np.linalg.norm(quaternions_xyzw, axis=1)
     if not (np.abs(lengths - 1) <= _LENGTH_TOLERANCE).all():
-        raise ValueError(f"a quaternion has length {lengths[np.argmax(~(np.abs(lengths - 1) <= _LENGTH_TOLERANCE))]:g}")
+        raise ValueError(
+            f"a quaternion has length {lengths[np.argmax(~(np.abs(lengths - 1) <= _LENGTH_TOLERANCE))]:g}"
+        )
     return se3.make(Rotation.from_quat(quaternions_xyzw).as_matrix(), positions)
 
 
-def poses_near(T_any_camera: FloatArray, known: FloatArray, stamps: FloatArray, path: Path) -> FloatArray:
+def poses_near(
+    T_any_camera: FloatArray, known: FloatArray, stamps: FloatArray, path: Path
+) -> FloatArray:
     """Interpolated poses ``(N, 4, 4)`` at stamps ``(N,)`` from ``(M, 4, 4)`` of ``path`` at known stamps ``(M,)``.
 
     The motion goes on at both ends. NaN, with a warning, where the nearest known pose is more than 0.1 s away; of poses
@@ -74,21 +78,33 @@ def poses_near(T_any_camera: FloatArray, known: FloatArray, stamps: FloatArray, 
     T_near = np.full((len(stamps), 4, 4), np.nan)
     if len(known) > 1:
         reach_s = float(np.clip(_BRIDGED * np.median(np.diff(known)), *_REACH_S))
-        first, last = np.searchsorted(known, (known[0] + reach_s, known[-1] - reach_s), side="right") - (0, 1)
+        first, last = np.searchsorted(
+            known, (known[0] + reach_s, known[-1] - reach_s), side="right"
+        ) - (0, 1)
         first, last = min(first, len(known) - 1), max(last, 0)
         before = T_any_camera[0] @ se3.invert(T_any_camera[first]) @ T_any_camera[0]
         after = T_any_camera[-1] @ se3.invert(T_any_camera[last]) @ T_any_camera[-1]
         reached = np.r_[2 * known[0] - known[first], known, 2 * known[-1] - known[last]]
-        T_near = se3.interpolate(np.concatenate([before[None], T_any_camera, after[None]]), reached, stamps)
+        T_near = se3.interpolate(
+            np.concatenate([before[None], T_any_camera, after[None]]), reached, stamps
+        )
         place = np.clip(np.searchsorted(known, stamps, side="right") - 1, 0, len(known) - 2)
         gap = np.minimum(np.abs(stamps - known[place]), np.abs(known[place + 1] - stamps))
         T_near[gap > reach_s] = np.nan
     are_known = known_poses(T_near)
     if not are_known.all():
-        longest = max(runs(np.flatnonzero(are_known).tolist()), key=lambda run: run[1] - run[0], default=None)
-        advice = "" if longest is None else f"; frames {longest[0]}:{longest[1] + 1} have one each (--frames)"
+        longest = max(
+            runs(np.flatnonzero(are_known).tolist()), key=lambda run: run[1] - run[0], default=None
+        )
+        advice = (
+            ""
+            if longest is None
+            else f"; frames {longest[0]}:{longest[1] + 1} have one each (--frames)"
+        )
         missing = int(np.argmin(are_known))
-        logger.warning("%s has no pose of image %d: the sequence has no reference%s", path, missing, advice)
+        logger.warning(
+            "%s has no pose of image %d: the sequence has no reference%s", path, missing, advice
+        )
     return T_near
 
 
@@ -110,7 +126,11 @@ def pose_files(paths: list[Path], stamps: FloatArray) -> FloatArray | None:
 
     Numbers that are not finite are those of a camera that lost track.
     """
-    there = [(stamp, path, read_matrix(path, "a pose")) for stamp, path in zip(stamps, paths) if path.exists()]
+    there = [
+        (stamp, path, read_matrix(path, "a pose"))
+        for stamp, path in zip(stamps, paths)
+        if path.exists()
+    ]
     known, poses = [], []
     for stamp, path, pose in there:
         if not np.isfinite(pose).all():
@@ -154,7 +174,11 @@ def read_truth(path: Path, stamps: FloatArray) -> FloatArray:
 
 def poses_beside(recording: Path) -> Path | None:
     """A file ``poses*.txt`` in or beside a recording; nothing tells whose poses they are."""
-    places = (recording, recording.absolute().parent) if recording.is_dir() else (recording.absolute().parent,)
+    places = (
+        (recording, recording.absolute().parent)
+        if recording.is_dir()
+        else (recording.absolute().parent,)
+    )
     return next((path for place in places for path in sorted(place.glob("poses*.txt"))), None)
 
 
@@ -179,7 +203,11 @@ def read_gps(path: Path) -> GpsTrack:
         )
     bad, rows = BadRows(path, SequenceError), np.array([row for row, _ in found], np.intp)
     table = np.array([fix for _, fix in found], dtype=np.float64)
-    is_fix = np.isfinite(table).all(axis=1) & (abs(table[:, 1:4]) <= _MOST).all(axis=1) & (table[:, 4] > 0)
+    is_fix = (
+        np.isfinite(table).all(axis=1)
+        & (abs(table[:, 1:4]) <= _MOST).all(axis=1)
+        & (table[:, 4] > 0)
+    )
     needed = "no GPS fix: a stamp, degrees, metres and a dilution above 0 are needed"
     rows, table = bad.without([(is_fix, needed)], rows, table)
     table = table[bad.in_order(table[:, 0], "stamps", rows, "GPS fixes")]
@@ -187,9 +215,13 @@ def read_gps(path: Path) -> GpsTrack:
     steps = np.diff(angles, axis=0)
     steps[:, 1] *= np.cos(angles[1:, 0])
     speeds = _EARTH_RADIUS_M * np.linalg.norm(steps, axis=1) / np.diff(table[:, 0])
-    if len(table) >= _LEAST_FIXES and np.median(speeds) > FASTEST_M_S:  # another column, unit or clock
+    if (
+        len(table) >= _LEAST_FIXES and np.median(speeds) > FASTEST_M_S
+    ):  # another column, unit or clock
         speed = f"{np.median(speeds):.0f} m/s"
-        raise SequenceError(f"{path}: its fixes move at {speed}: check its columns, and that stamps are seconds")
+        raise SequenceError(
+            f"{path}: its fixes move at {speed}: check its columns, and that stamps are seconds"
+        )
     return GpsTrack(table[:, 0], table[:, 1:4], table[:, 4])
 
 
@@ -199,7 +231,9 @@ def _csv_rows(lines: list[str], path: Path) -> list[tuple[int, list[float]]]:
     reader = csv.DictReader(lines, skipinitialspace=True, delimiter=delimiter)
     missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
     if missing:
-        raise SequenceError(f"{path} lacks {', '.join(missing)}: its first row must name {', '.join(_COLUMNS)}")
+        raise SequenceError(
+            f"{path} lacks {', '.join(missing)}: its first row must name {', '.join(_COLUMNS)}"
+        )
     rows = []
     for row in reader:
         try:

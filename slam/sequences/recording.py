@@ -109,14 +109,18 @@ class RecordedSequence:
             self.intrinsics, self.camera_height_m = self.camera, usual_height_m
         _require_plausible_rate(self.name, self.stamps)
         if self.T_camera_lidar is not None and not is_se3(self.T_camera_lidar, _RIGID_TOLERANCE):
-            raise SequenceError(f"{self.name}: the calibration of its LiDAR is no rotation and translation")
+            raise SequenceError(
+                f"{self.name}: the calibration of its LiDAR is no rotation and translation"
+            )
         self.recorded = len(self.stamps)
         self.take_truth(self.T_any_camera)
 
     def cut(self, start: int, stop: int) -> Self:
         """The frames [start, stop) as a sequence of their own; stamps stay, poses begin at the identity."""
         if not 0 <= start < stop <= len(self):
-            raise SequenceError(f"no frames {start}:{stop} in sequence {self.name}: it has {len(self)}")
+            raise SequenceError(
+                f"no frames {start}:{stop} in sequence {self.name}: it has {len(self)}"
+            )
         part = copy(self)
         part.start, part.stamps = self.start + start, self.stamps[start:stop]
         part.sources = tuple(source.shifted(start) for source in self.sources)
@@ -130,10 +134,14 @@ class RecordedSequence:
         self.reference = self.true_poses(0, len(self))
         if self.reference is None:
             return
-        speeds = np.linalg.norm(np.diff(self.reference[:, :3, 3], axis=0), axis=1) / np.diff(self.stamps)
+        speeds = np.linalg.norm(np.diff(self.reference[:, :3, 3], axis=0), axis=1) / np.diff(
+            self.stamps
+        )
         fast = np.flatnonzero(speeds > FASTEST_M_S)
         if fast.size:
-            text = "%s: its true poses move at %g m/s after frame %d: check their unit, and the stamps"
+            text = (
+                "%s: its true poses move at %g m/s after frame %d: check their unit, and the stamps"
+            )
             logger.warning(text, self.name, speeds[fast[0]], fast[0])
 
     def __len__(self) -> int:
@@ -143,7 +151,9 @@ class RecordedSequence:
     def frame(self, index: int) -> Frame:
         """Read one frame; ``MissingFrameError`` where its number is missing from the files."""
         if not 0 <= index < len(self):
-            raise SequenceError(f"no frame {index} in sequence {self.name}: it has frames 0 to {len(self) - 1}")
+            raise SequenceError(
+                f"no frame {index} in sequence {self.name}: it has frames 0 to {len(self) - 1}"
+            )
         with sequence_errors():
             image = self.images.read(self.start + index)
         if self.undistortion is not None:
@@ -186,7 +196,9 @@ class RecordedSequence:
 class GrowingSequence(RecordedSequence):
     """A sequence that grows by a frame at a time; its images are not kept."""
 
-    def __init__(self, intrinsics: Intrinsics, camera_height_m: float | None, name: str = "live") -> None:
+    def __init__(
+        self, intrinsics: Intrinsics, camera_height_m: float | None, name: str = "live"
+    ) -> None:
         def forgotten(index: int) -> Image:
             raise SlamError(f"frame {index} of a live drive is not kept")
 
@@ -201,11 +213,20 @@ def _require_plausible_rate(name: str, stamps: FloatArray) -> None:
     periods = np.diff(stamps)
     period, longest = float(np.median(periods)), float(periods.max())
     if not POSSIBLE_PERIODS_S[0] <= period <= POSSIBLE_PERIODS_S[1]:
-        raise SequenceError(f"{name}: its frames are {period:g} s apart: check its stamps, or fps, and their unit")
+        raise SequenceError(
+            f"{name}: its frames are {period:g} s apart: check its stamps, or fps, and their unit"
+        )
     if not _USUAL_PERIODS_S[0] <= period <= _USUAL_PERIODS_S[1]:
-        logger.warning("%s: its frames are %g s apart: check its stamps, or fps, and their unit", name, period)
+        logger.warning(
+            "%s: its frames are %g s apart: check its stamps, or fps, and their unit", name, period
+        )
     if longest > max(_LONG_PAUSE_S, _LONG_PAUSE_PERIODS * period):
-        logger.warning("%s: its stamps pause for %g s before frame %d", name, longest, int(periods.argmax()) + 1)
+        logger.warning(
+            "%s: its stamps pause for %g s before frame %d",
+            name,
+            longest,
+            int(periods.argmax()) + 1,
+        )
 
 
 def frame_range(text: str, frames: int) -> tuple[int, int]:
@@ -217,7 +238,9 @@ def frame_range(text: str, frames: int) -> tuple[int, int]:
         begin, end = text.split(":")
         start, stop = int(begin) if begin.strip() else 0, int(end) if end.strip() else frames
     except ValueError:
-        raise SequenceError(f"--frames {text!r} is not a range: write A:B, such as 0:300 or 100:") from None
+        raise SequenceError(
+            f"--frames {text!r} is not a range: write A:B, such as 0:300 or 100:"
+        ) from None
     first = start + frames if start < 0 else start
     last = stop + frames if stop < 0 else stop
     if not (0 <= first < frames and 0 <= last <= frames):
@@ -237,11 +260,16 @@ def uniform_stamps(frames: int, fps: float) -> FloatArray:
 def read_stamps(path: Path, files: NumberedFiles) -> FloatArray:
     """A file with one time in seconds a row, perhaps after a number or a name, checked by `require_stamps`."""
     lines = rows_of(path, SequenceError, "one time in seconds a row")
-    rows = [[number_or_nan(in_seconds(word)) for word in re.split(r"[,;\s]+", line)] for _, line in lines]
+    rows = [
+        [number_or_nan(in_seconds(word)) for word in re.split(r"[,;\s]+", line)]
+        for _, line in lines
+    ]
     has_header = files.rows_of(len(rows)) is None and files.rows_of(len(rows) - 1) is not None
     rows = rows[has_header:]
     first, second = (np.array([row[k] if k < len(row) else np.nan for row in rows]) for k in (0, 1))
-    is_numbered = np.isfinite(second).any() and not (np.abs(np.diff(first) - 1) > 0).any()  # NaN is a name
+    is_numbered = (
+        np.isfinite(second).any() and not (np.abs(np.diff(first) - 1) > 0).any()
+    )  # NaN is a name
     return require_stamps(second if is_numbered else first, path, files)
 
 
@@ -277,7 +305,10 @@ def _mended_stamps(stamps: FloatArray, path: Path) -> FloatArray:
     if len(order) == 1:
         bad.say(0, wanted)
     rows, times = np.sort(rows[order]), times[order]
-    beyond, period = len(stamps), float(np.median(np.diff(times) / np.diff(rows)))  # at both ends the rate goes on
+    beyond, period = (
+        len(stamps),
+        float(np.median(np.diff(times) / np.diff(rows))),
+    )  # at both ends the rate goes on
     times = np.r_[times[0] - beyond * period, times, times[-1] + beyond * period]
     known = np.r_[rows[0] - beyond, rows, rows[-1] + beyond]
     return np.asarray(np.interp(np.arange(1, len(stamps) + 1), known, times))
@@ -289,4 +320,8 @@ def _require_short_gaps(files: NumberedFiles, stamps: FloatArray) -> None:
         if stamps[last + 1] - stamps[first - 1] > _MAX_GAP_S:
             raise too_long(files, first, last)
     if files.gaps():
-        logger.warning("%s: %s; the motion across gaps is interpolated", files.paths[0].parent, files.describe_gaps())
+        logger.warning(
+            "%s: %s; the motion across gaps is interpolated",
+            files.paths[0].parent,
+            files.describe_gaps(),
+        )

@@ -35,7 +35,9 @@ _POSES = (
     "geometry_msgs/msg/PoseWithCovarianceStamped",
 )
 _POSITIONS = ("sensor_msgs/msg/NavSatFix", "geometry_msgs/msg/PointStamped")
-_TRUTH = re.compile(r"truth|(?:^|[/_])gt(?:$|[/_])|vicon|mocap|optitrack|qualisys|natnet", re.IGNORECASE)
+_TRUTH = re.compile(
+    r"truth|(?:^|[/_])gt(?:$|[/_])|vicon|mocap|optitrack|qualisys|natnet", re.IGNORECASE
+)
 _STATIC_TOPIC, _MOVING_TOPIC = "/tf_static", "/tf"
 _MOST_OUT_OF_PLACE = 5  # messages, of one that was recorded late
 _SOUGHT_IMAGES = 100  # one of which must be readable
@@ -57,7 +59,11 @@ class StampedMessages:
         if not pairs:
             raise SequenceError(f"topic {topic} of {bag.path} has no messages")
         self._times_ns = [time_ns for time_ns, _ in pairs]
-        stamps_ns = [stamp_ns for _, stamp_ns in pairs] if any(stamp for _, stamp in pairs) else self._times_ns
+        stamps_ns = (
+            [stamp_ns for _, stamp_ns in pairs]
+            if any(stamp for _, stamp in pairs)
+            else self._times_ns
+        )
         numbers = sorted(range(len(pairs)), key=lambda number: stamps_ns[number])
         if max(abs(number - place) for place, number in enumerate(numbers)) > _MOST_OUT_OF_PLACE:
             steps = np.diff(stamps_ns)
@@ -68,10 +74,16 @@ class StampedMessages:
                 int(steps.argmin()) + 1,
             )
             stamps_ns, numbers = self._times_ns, list(range(len(pairs)))
-        self._numbers = [n for k, n in enumerate(numbers) if not k or stamps_ns[n] > stamps_ns[numbers[k - 1]]]
+        self._numbers = [
+            n for k, n in enumerate(numbers) if not k or stamps_ns[n] > stamps_ns[numbers[k - 1]]
+        ]
         if len(self._numbers) < len(pairs):
-            logger.warning("%s: %d messages repeat a stamp: left out", topic, len(pairs) - len(self._numbers))
-        self.stamps: FloatArray = np.array([stamps_ns[number] / _NANOSECONDS for number in self._numbers])
+            logger.warning(
+                "%s: %d messages repeat a stamp: left out", topic, len(pairs) - len(self._numbers)
+            )
+        self.stamps: FloatArray = np.array(
+            [stamps_ns[number] / _NANOSECONDS for number in self._numbers]
+        )
         self._next = 0
         self._following: Iterator[tuple[int, bytes]] = iter(())
 
@@ -92,7 +104,9 @@ class StampedMessages:
             if position == number + 1:
                 self._next = position
                 return self._bag.parse(self.topic, data)
-        raise SequenceError(f"{self._bag.path} breaks off at message {number} of {self.topic}: copy it again")
+        raise SequenceError(
+            f"{self._bag.path} breaks off at message {number} of {self.topic}: copy it again"
+        )
 
     def points(self, index: int, where: str) -> FloatArray:
         """The points ``(P, 3)`` of a cloud, metres; ``where`` names it in errors."""
@@ -112,7 +126,9 @@ def images_of(messages: StampedMessages, where: str) -> ReadImages:
     def read(row: int) -> Image:
         image = decode(row)
         if image.shape[:2] != (height, width):
-            raise SequenceError(f"{where} is {image.shape[1]}x{image.shape[0]}, the first are {width}x{height}")
+            raise SequenceError(
+                f"{where} is {image.shape[1]}x{image.shape[0]}, the first are {width}x{height}"
+            )
         return image
 
     return ReadImages(width, height, len(rows), read)
@@ -161,16 +177,24 @@ def transforms(bag: Bag, topic: str) -> Iterator[tuple[str, str, float, FloatArr
             try:
                 T_parent_child = transform_of(each.transform)
             except ValueError as error:
-                logger.warning("%s: the transform of %r is left out: %s", topic, each.child_frame_id, error)
+                logger.warning(
+                    "%s: the transform of %r is left out: %s", topic, each.child_frame_id, error
+                )
                 continue
-            parent, child = (name.removeprefix("/") for name in (each.header.frame_id, each.child_frame_id))
+            parent, child = (
+                name.removeprefix("/") for name in (each.header.frame_id, each.child_frame_id)
+            )
             yield parent, child, stamp.sec + 1e-9 * stamp.nanosec, T_parent_child
 
 
 def transform_of(message: Any) -> FloatArray:
     """``T_parent_child`` ``(4, 4)`` of a ``Transform`` or a ``Pose``; ``ValueError`` where it is none."""
     is_pose = hasattr(message, "position")
-    t, q = (message.position, message.orientation) if is_pose else (message.translation, message.rotation)
+    t, q = (
+        (message.position, message.orientation)
+        if is_pose
+        else (message.translation, message.rotation)
+    )
     (T,) = poses_of(np.array([[t.x, t.y, t.z]]), np.array([[q.x, q.y, q.z, q.w]]))
     return np.asarray(T)
 
@@ -182,13 +206,22 @@ def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> Recorde
     stored, stamps = images_of(messages, f"an image of {topic} in {bag.path}"), messages.stamps
     fps = 1.0 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
     calibration = partial(_calibration, bag, topic, fps, (stored.width, stored.height))
-    camera = find_camera_file(asked, path.absolute().parent, wanted_by=str(path), images=stored, own=calibration)
+    camera = find_camera_file(
+        asked, path.absolute().parent, wanted_by=str(path), images=stored, own=calibration
+    )
     mounts: Mounts = {child: (parent, T) for parent, child, _, T in transforms(bag, _STATIC_TOPIC)}
     frame = bag.first(topic).header.frame_id
     truth, sources = _true_poses(bag, mounts, frame, stamps), (Source(f"bag/{name}"),)
     extrinsics, scans = _scans(bag, mounts, frame, stamps)
     return RecordedSequence(
-        name, stored, camera, stamps, sources, T_any_camera=truth, T_camera_lidar=extrinsics, scans=scans
+        name,
+        stored,
+        camera,
+        stamps,
+        sources,
+        T_any_camera=truth,
+        T_camera_lidar=extrinsics,
+        scans=scans,
     )
 
 
@@ -205,11 +238,17 @@ def _calibration(bag: Bag, topic: str, fps: float, size: tuple[int, int]) -> Cam
     """By the ``camera_info`` beside the images."""
     known = bag.topics(bags.CAMERA_INFO)
     base, home = topic.removesuffix("/compressed"), _home(topic)
-    info = next((name for name in (f"{home}/camera_info", f"{base}/camera_info") if name in known), None)
+    info = next(
+        (name for name in (f"{home}/camera_info", f"{base}/camera_info") if name in known), None
+    )
     if info is None:
         held = ", ".join(known) or "no camera_info"
-        raise SequenceError(f"no {home}/camera_info for {topic} in {bag.path}: it has {held}; give --camera")
-    return bags.camera_file_of(bag.first(info), is_rectified(topic), fps, f"{info} in {bag.path}", size)
+        raise SequenceError(
+            f"no {home}/camera_info for {topic} in {bag.path}: it has {held}; give --camera"
+        )
+    return bags.camera_file_of(
+        bag.first(info), is_rectified(topic), fps, f"{info} in {bag.path}", size
+    )
 
 
 def _home(topic: str) -> str:
@@ -230,16 +269,22 @@ def _true_poses(bag: Bag, mounts: Mounts, camera: str, stamps: FloatArray) -> Fl
             unused[topic] = f"has no static transform from its {body!r} to the camera's {camera!r}"
         else:
             if body is None:
-                logger.warning("%s does not say whose poses it has: they are taken for the camera's", topic)
+                logger.warning(
+                    "%s does not say whose poses it has: they are taken for the camera's", topic
+                )
             known, T_any_body = _poses(StampedMessages(bag, topic))
             return poses_near(T_any_body @ T_body_camera, known, stamps, bag.path)
     for (parent, body), (known, T_any_body) in moving_frames(bag).items():
         T_body_camera = transform_between(mounts, body, camera)
         if T_body_camera is not None and any(map(_TRUTH.search, (parent, body))):
             return poses_near(T_any_body @ T_body_camera, known, stamps, bag.path)
-        unused[f"{parent} to {body} in {_MOVING_TOPIC}"] = "is not named as truth, or not joined to the camera"
+        unused[f"{parent} to {body} in {_MOVING_TOPIC}"] = (
+            "is not named as truth, or not joined to the camera"
+        )
     for topic, reason in unused.items():
-        logger.warning("%s %s: it is not used; a TUM file of true poses is taken by --truth", topic, reason)
+        logger.warning(
+            "%s %s: it is not used; a TUM file of true poses is taken by --truth", topic, reason
+        )
     return None
 
 
@@ -269,11 +314,17 @@ def _scans(
     for topic in bag.topics(bags.POINT_CLOUD):
         T_camera_lidar = transform_between(mounts, camera, bag.first(topic).header.frame_id)
         if T_camera_lidar is None:
-            logger.warning("%s is not used: no static transform from its frame to the camera's %r", topic, camera)
+            logger.warning(
+                "%s is not used: no static transform from its frame to the camera's %r",
+                topic,
+                camera,
+            )
             continue
         clouds, where = StampedMessages(bag, topic), f"a cloud of {topic} in {bag.path}"
         pairs = zip(*nearest_pairs(stamps, clouds.stamps, _SCAN_DELAY_S))
-        return T_camera_lidar, {int(frame): partial(clouds.points, int(cloud), where) for frame, cloud in pairs}
+        return T_camera_lidar, {
+            int(frame): partial(clouds.points, int(cloud), where) for frame, cloud in pairs
+        }
     return None, {}
 
 
@@ -290,7 +341,10 @@ def _find(path: Path, asked: Asked) -> dict[str, Opener]:
     cameras = _cameras(path, asked)
     if not cameras:
         with closing(Bag(path)) as bag:
-            held = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.types.items())) or "nothing"
+            held = (
+                ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.types.items()))
+                or "nothing"
+            )
         raise SequenceError(f"bag {path} has no topic with images of a camera: it holds {held}")
     return cameras
 
@@ -299,7 +353,10 @@ def _cameras(path: Path, asked: Asked) -> dict[str, Opener]:
     """The cameras of a bag by topic."""
     topics, stem = camera_topics(path), path.absolute().stem
     names = [stem + topic.replace("/", "_") if len(topics) > 1 else stem for topic in topics]
-    return {topic: partial(open_topic, path, topic, name, asked.camera) for topic, name in zip(topics, names)}
+    return {
+        topic: partial(open_topic, path, topic, name, asked.camera)
+        for topic, name in zip(topics, names)
+    }
 
 
 LOADER = Loader("ROS bag", "a .bag, .db3 or .mcap", _find)

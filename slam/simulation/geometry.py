@@ -50,7 +50,9 @@ _OF_TRIANGLES = ("uv", "normals", "tangents", "instance", "material")
 def _patch_triangles(rows: int, columns: int) -> IntArray:
     """Triangles of a grid of vertices, wound so that (column, row) is right-handed, ``(T, 3)``."""
     index = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    a, b, c, d = (
+        part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1])
+    )
     return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
 
 
@@ -61,7 +63,9 @@ class Soup:
         self._rng = rng
         # vertices, triangles, their texture coordinates and instances, patch by patch
         self._patches: list[tuple[FloatArray, IntArray, FloatArray, IntArray]] = []
-        self._looks: list[tuple[int, FloatArray, FloatArray]] = []  # material, colours and parameters, by instance
+        self._looks: list[
+            tuple[int, FloatArray, FloatArray]
+        ] = []  # material, colours and parameters, by instance
         self._count = 0  # of vertices
 
     @property
@@ -79,13 +83,19 @@ class Soup:
         """Register an instance with its colours and parameters; return its number."""
         row = np.zeros(PARAMETERS)
         row[: len(parameters)] = parameters
-        self._looks.append((int(material), np.stack([colour, colour if colour2 is None else colour2]), row))
+        self._looks.append(
+            (int(material), np.stack([colour, colour if colour2 is None else colour2]), row)
+        )
         return len(self._looks) - 1
 
     def patch(self, points: FloatArray, uv: FloatArray, instance: int) -> None:
         """Add a grid of quads: vertices in the plan ``(R, C, 3)`` and texture coordinates in metres ``(R, C, 2)``."""
         triangles = _patch_triangles(points.shape[0], points.shape[1])
-        of_triangles = triangles + self._count, uv.reshape(-1, 2)[triangles], np.full(len(triangles), instance)
+        of_triangles = (
+            triangles + self._count,
+            uv.reshape(-1, 2)[triangles],
+            np.full(len(triangles), instance),
+        )
         self._patches.append((points.reshape(-1, 3), *of_triangles))
         self._count += points.shape[0] * points.shape[1]
 
@@ -93,7 +103,9 @@ class Soup:
         """Add one parallelogram, textured in metres from its corner."""
         points = np.stack([[corner, corner + along], [corner + up, corner + along + up]])
         width, height = float(np.linalg.norm(along)), float(np.linalg.norm(up))
-        self.patch(points, np.array([[[0, 0], [width, 0]], [[0, height], [width, height]]]), instance)
+        self.patch(
+            points, np.array([[[0, 0], [width, 0]], [[0, height], [width, height]]]), instance
+        )
 
     def finish(self, bend: "Bend") -> Mesh:
         """Bend every vertex from plan to street coordinates and drop triangles without area."""
@@ -139,21 +151,29 @@ class Bend:
     amplitudes: FloatArray  # of the sway in x and in y and of the hills, metres, (3,)
     wavelengths: FloatArray  # of the same, metres, (3,)
     phases: FloatArray  # of the same, radians, (3, 2)
-    road: FloatArray | None = None  # x, y and heading of a lone road every metre from road_start on, (M, 3)
+    road: FloatArray | None = (
+        None  # x, y and heading of a lone road every metre from road_start on, (M, 3)
+    )
     road_start: float = 0.0  # plan x of its first row
 
     def __call__(self, points: FloatArray) -> FloatArray:
         """Map plan points ``(..., 3)`` to the street frame."""
         x, y, z = points[..., 0], points[..., 1], points[..., 2]
         k = 2.0 * np.pi / self.wavelengths
-        hill = self.amplitudes[2] * np.sin(k[2] * x + self.phases[2, 0]) * np.cos(k[2] * y + self.phases[2, 1])
+        hill = (
+            self.amplitudes[2]
+            * np.sin(k[2] * x + self.phases[2, 0])
+            * np.cos(k[2] * y + self.phases[2, 1])
+        )
         if self.road is None:
             sway_x = self.amplitudes[0] * np.sin(k[0] * y + self.phases[0, 0])
             sway_y = self.amplitudes[1] * np.sin(k[1] * x + self.phases[1, 0])
             return np.stack([x + sway_x, y + sway_y, z + hill], axis=-1)
         steps = np.arange(len(self.road)) + self.road_start
         centre_x, centre_y, heading = (np.interp(x, steps, self.road[:, i]) for i in range(3))
-        return np.stack([centre_x - y * np.sin(heading), centre_y + y * np.cos(heading), z + hill], axis=-1)
+        return np.stack(
+            [centre_x - y * np.sin(heading), centre_y + y * np.cos(heading), z + hill], axis=-1
+        )
 
 
 FLAT = Bend(np.zeros(3), np.ones(3), np.zeros((3, 2)))  # the plan as it is
@@ -167,19 +187,36 @@ def town_bend(rng: np.random.Generator, hills: tuple[float, float] | None = None
     if hills is not None:
         wavelengths[2] = hills[1]
         amplitudes[2] = hills[0] * hills[1] / (2.0 * np.pi)
-        phases[2, 1] = rng.uniform(-0.35, 0.35)  # across the road at y = 0 it is at most a third as steep as along it
+        phases[2, 1] = rng.uniform(
+            -0.35, 0.35
+        )  # across the road at y = 0 it is at most a third as steep as along it
     return Bend(amplitudes, wavelengths, phases)
 
 
-def road_bend(rng: np.random.Generator, start: float, end: float, hills: tuple[float, float] | None = None) -> Bend:
+def road_bend(
+    rng: np.random.Generator, start: float, end: float, hills: tuple[float, float] | None = None
+) -> Bend:
     """A road whose heading wanders within about 35 degrees, radius of curvature at least about 80 m."""
     town = town_bend(rng, hills)
     s = np.arange(np.floor(start), np.ceil(end) + 2.0)
     heading = np.zeros_like(s)
-    for wavelength, amplitude in ((rng.uniform(330.0, 480.0), 0.38), (rng.uniform(150.0, 220.0), 0.14)):
-        heading += rng.uniform(0.5, 1.0) * amplitude * np.sin(2 * np.pi * s / wavelength + rng.uniform(0, 6.28))
+    for wavelength, amplitude in (
+        (rng.uniform(330.0, 480.0), 0.38),
+        (rng.uniform(150.0, 220.0), 0.14),
+    ):
+        heading += (
+            rng.uniform(0.5, 1.0)
+            * amplitude
+            * np.sin(2 * np.pi * s / wavelength + rng.uniform(0, 6.28))
+        )
     position = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], 1), axis=0)
-    return Bend(town.amplitudes, town.wavelengths, town.phases, np.column_stack([position, heading]), float(s[0]))
+    return Bend(
+        town.amplitudes,
+        town.wavelengths,
+        town.phases,
+        np.column_stack([position, heading]),
+        float(s[0]),
+    )
 
 
 class Moving:
@@ -192,16 +229,23 @@ class Moving:
             first_instances.append(soup.instances)
             make(soup)
         self._mesh = soup.finish(FLAT)
-        self._thing_of_triangle = np.searchsorted(first_instances, self._mesh.instance, side="right") - 1
+        self._thing_of_triangle = (
+            np.searchsorted(first_instances, self._mesh.instance, side="right") - 1
+        )
 
     def placed(self, T_scene_things: dict[int, FloatArray]) -> list[Mesh]:
         """One mesh of the things of these numbers at their poses ``(4, 4)``; none of no things."""
         if not T_scene_things:
             return []
-        parts = [self._part(number, T_scene_thing) for number, T_scene_thing in T_scene_things.items()]
+        parts = [
+            self._part(number, T_scene_thing) for number, T_scene_thing in T_scene_things.items()
+        ]
         corners = np.concatenate([part.vertices for part in parts])
         corners_of = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
-        tables = {name: np.concatenate([getattr(part, name) for part in parts], axis=-1) for name in _OF_TRIANGLES}
+        tables = {
+            name: np.concatenate([getattr(part, name) for part in parts], axis=-1)
+            for name in _OF_TRIANGLES
+        }
         return [dataclasses.replace(self._mesh, vertices=corners, triangles=corners_of, **tables)]
 
     def _part(self, number: int, T_scene_thing: FloatArray) -> Mesh:

@@ -20,10 +20,34 @@ Piece = Callable[[Soup, np.random.Generator, FloatArray, float], None]
 WALL = 0.14  # thickness, metres
 DOOR_HEIGHT = 2.1
 KINDS = ("living", "kitchen", "office", "bedroom", "bath", "office")
-WOODS = ((0.50, 0.34, 0.20), (0.68, 0.52, 0.34), (0.82, 0.80, 0.76), (0.30, 0.21, 0.15), (0.60, 0.42, 0.28))
-CLOTHS = ((0.25, 0.32, 0.45), (0.55, 0.30, 0.25), (0.42, 0.44, 0.42), (0.62, 0.56, 0.45), (0.24, 0.38, 0.32))
-PAINTS = ((0.70, 0.20, 0.16), (0.15, 0.35, 0.60), (0.85, 0.68, 0.20), (0.20, 0.48, 0.36), (0.85, 0.82, 0.76))
-_WALLS = ((0.86, 0.84, 0.79), (0.80, 0.82, 0.84), (0.78, 0.72, 0.60), (0.66, 0.72, 0.68), (0.74, 0.62, 0.56))
+WOODS = (
+    (0.50, 0.34, 0.20),
+    (0.68, 0.52, 0.34),
+    (0.82, 0.80, 0.76),
+    (0.30, 0.21, 0.15),
+    (0.60, 0.42, 0.28),
+)
+CLOTHS = (
+    (0.25, 0.32, 0.45),
+    (0.55, 0.30, 0.25),
+    (0.42, 0.44, 0.42),
+    (0.62, 0.56, 0.45),
+    (0.24, 0.38, 0.32),
+)
+PAINTS = (
+    (0.70, 0.20, 0.16),
+    (0.15, 0.35, 0.60),
+    (0.85, 0.68, 0.20),
+    (0.20, 0.48, 0.36),
+    (0.85, 0.82, 0.76),
+)
+_WALLS = (
+    (0.86, 0.84, 0.79),
+    (0.80, 0.82, 0.84),
+    (0.78, 0.72, 0.60),
+    (0.66, 0.72, 0.68),
+    (0.74, 0.62, 0.56),
+)
 _AISLE = 1.0  # left free between the furniture at the walls and the table in the middle, metres
 _DEEPEST = 0.65  # piece at a wall, metres
 _STEP = 0.5  # between the vertices of walls, which carry the light, metres
@@ -62,7 +86,12 @@ class House:
         x0, y0, x1, y1 = room.area
         found = []
         for left, low, right, high in self.doors:
-            spans = ((left - x0, right - x0), (low - y0, high - y0), (x1 - right, x1 - left), (y1 - high, y1 - low))
+            spans = (
+                (left - x0, right - x0),
+                (low - y0, high - y0),
+                (x1 - right, x1 - left),
+                (y1 - high, y1 - low),
+            )
             touches = (high == y0, left == x1, low == y1, right == x0)[number]
             along = spans[number]
             if touches and along[0] > 0.0 and along[1] < room.side(number)[2]:
@@ -78,7 +107,12 @@ def draw_house(seed: int) -> House:
     corridor = Room("corridor", (0.0, 0.0, length, width), height, (3,))
     wide, deep = float(rng.uniform(9.0, 13.0)), float(rng.uniform(7.5, 10.0))
     hall_x, hall_y = length + WALL, 0.5 * width - deep * float(rng.uniform(0.35, 0.65))
-    hall = Room("hall", (hall_x, hall_y, hall_x + wide, hall_y + deep), float(rng.uniform(3.8, 5.0)), (0, 1, 2))
+    hall = Room(
+        "hall",
+        (hall_x, hall_y, hall_x + wide, hall_y + deep),
+        float(rng.uniform(3.8, 5.0)),
+        (0, 1, 2),
+    )
     rooms, doors = [corridor, hall], [(length, 0.5 * width - 0.8, hall_x, 0.5 * width + 0.8)]
     kinds = list(rng.permutation(KINDS)) + list(rng.permutation(KINDS))
     for north in (False, True):
@@ -88,10 +122,14 @@ def draw_house(seed: int) -> House:
             end = length if length - end < 3.4 + WALL else end
             depth = float(rng.uniform(3.4, 5.5))
             low, high = (width + WALL, width + WALL + depth) if north else (-WALL - depth, -WALL)
-            rooms.append(Room(str(kinds.pop()), (start, low, end, high), height, (2,) if north else (0,)))
+            rooms.append(
+                Room(str(kinds.pop()), (start, low, end, high), height, (2,) if north else (0,))
+            )
             door = start + float(rng.uniform(0.75, end - start - 1.85))
             opening = float(rng.uniform(0.95, 1.1))
-            doors.append((door, width, door + opening, low) if north else (door, -WALL, door + opening, 0.0))
+            doors.append(
+                (door, width, door + opening, low) if north else (door, -WALL, door + opening, 0.0)
+            )
             if before is not None and rng.random() < 0.5:
                 middle = width + WALL + 1.2 if north else -WALL - 2.2
                 doors.append((before, middle, start, middle + 1.0))
@@ -100,7 +138,12 @@ def draw_house(seed: int) -> House:
 
 
 def solid(
-    soup: Soup, frame: FloatArray, low: tuple[float, ...], size: tuple[float, ...], look: int, top: int = -1
+    soup: Soup,
+    frame: FloatArray,
+    low: tuple[float, ...],
+    size: tuple[float, ...],
+    look: int,
+    top: int = -1,
 ) -> None:
     """A box by its lowest corner and its size, closed below."""
     corner, extent = np.array(low), np.array(size)
@@ -111,7 +154,12 @@ def solid(
 
 
 def plate(
-    soup: Soup, frame: FloatArray, low: tuple[float, ...], size: tuple[float, ...], front: int, rest: int
+    soup: Soup,
+    frame: FloatArray,
+    low: tuple[float, ...],
+    size: tuple[float, ...],
+    front: int,
+    rest: int,
 ) -> None:
     """A box that shows ``front`` on the side that leaves the wall, a hair before the box."""
     solid(soup, frame, low, size, rest)
@@ -127,7 +175,9 @@ def wood(soup: Soup, rng: np.random.Generator, *door: float) -> int:
 def shelf(soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float) -> None:
     """Books to above the eyes."""
     height, tone = float(rng.uniform(1.7, 2.1)), colour(rng, *WOODS)
-    books = soup.instance(Material.BOOKS, tone, None, (width, height, height / float(rng.integers(5, 8))))
+    books = soup.instance(
+        Material.BOOKS, tone, None, (width, height, height / float(rng.integers(5, 8)))
+    )
     plate(soup, frame, (0, 0, 0), (width, 0.3, height), books, soup.instance(Material.WOOD, tone))
 
 
@@ -140,7 +190,14 @@ def cupboard(soup: Soup, rng: np.random.Generator, frame: FloatArray, width: flo
 def chest(soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float) -> None:
     """Drawers with a few things on them."""
     height = float(rng.uniform(0.7, 0.95))
-    solid(soup, frame, (0, 0, 0), (width, 0.42, height), wood(soup, rng, width / 2.0, height / 3.0), wood(soup, rng))
+    solid(
+        soup,
+        frame,
+        (0, 0, 0),
+        (width, 0.42, height),
+        wood(soup, rng, width / 2.0, height / 3.0),
+        wood(soup, rng),
+    )
     _things(soup, rng, frame, width, 0.4, height)
 
 
@@ -160,11 +217,25 @@ def desk(soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float) 
 def counter(soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float) -> None:
     """A kitchen's worktop with tiles above it."""
     stone = soup.instance(Material.FABRIC, colour(rng, (0.3, 0.3, 0.31), (0.7, 0.68, 0.64)))
-    solid(soup, frame, (0, 0, 0), (width, 0.6, 0.86), wood(soup, rng, width / np.ceil(width / 0.6), 0.86))
+    solid(
+        soup,
+        frame,
+        (0, 0, 0),
+        (width, 0.6, 0.86),
+        wood(soup, rng, width / np.ceil(width / 0.6), 0.86),
+    )
     solid(soup, frame, (0, 0, 0.86), (width, 0.63, 0.04), stone)
-    tiles = soup.instance(Material.TILES, colour(rng, *PAINTS, (0.9, 0.9, 0.88)), np.full(3, 0.75), (0.15, 0.008))
+    tiles = soup.instance(
+        Material.TILES, colour(rng, *PAINTS, (0.9, 0.9, 0.88)), np.full(3, 0.75), (0.15, 0.008)
+    )
     plate(soup, frame, (0, 0, 0.9), (width, 0.015, 0.6), tiles, stone)
-    solid(soup, frame, (0, 0, 1.5), (width, 0.33, 0.6), wood(soup, rng, width / np.ceil(width / 0.6), 0.6))
+    solid(
+        soup,
+        frame,
+        (0, 0, 1.5),
+        (width, 0.33, 0.6),
+        wood(soup, rng, width / np.ceil(width / 0.6), 0.6),
+    )
     _things(soup, rng, frame, width, 0.55, 0.9)
 
 
@@ -175,20 +246,36 @@ def sofa(soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float) 
     solid(soup, frame, (0, 0, 0.42), (width, 0.2, 0.4), cloth)
     for left in (0.0, width - 0.16):
         solid(soup, frame, (left, 0, 0.42), (0.16, 0.65, 0.18), cloth)
-    pillow = soup.instance(Material.CARPET, colour(rng, *PAINTS), colour(rng, *PAINTS), (0.4, 0.36, 0.11))
+    pillow = soup.instance(
+        Material.CARPET, colour(rng, *PAINTS), colour(rng, *PAINTS), (0.4, 0.36, 0.11)
+    )
     plate(soup, frame, (0.3, 0.2, 0.43), (0.4, 0.1, 0.36), pillow, cloth)
 
 
 def bed(soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float) -> None:
     """A bed along the wall, with a pillow and a pattern on its cover."""
-    cover = soup.instance(Material.CARPET, colour(rng, *CLOTHS), colour(rng, *PAINTS), (width, 0.65, 0.3))
+    cover = soup.instance(
+        Material.CARPET, colour(rng, *CLOTHS), colour(rng, *PAINTS), (width, 0.65, 0.3)
+    )
     solid(soup, frame, (0, 0, 0), (width, 0.65, 0.35), wood(soup, rng), cover)
-    solid(soup, frame, (0.05, 0.06, 0.35), (0.45, 0.52, 0.12), soup.instance(Material.FABRIC, np.full(3, 0.85)))
+    solid(
+        soup,
+        frame,
+        (0.05, 0.06, 0.35),
+        (0.45, 0.52, 0.12),
+        soup.instance(Material.FABRIC, np.full(3, 0.85)),
+    )
 
 
 def plant(soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float) -> None:
     """Leaves in a pot."""
-    solid(soup, frame, (0.15, 0.1, 0), (0.3, 0.3, 0.35), soup.instance(Material.FABRIC, colour(rng, *PAINTS)))
+    solid(
+        soup,
+        frame,
+        (0.15, 0.1, 0),
+        (0.3, 0.3, 0.35),
+        soup.instance(Material.FABRIC, colour(rng, *PAINTS)),
+    )
     leaf = colour(rng, (0.15, 0.30, 0.12), (0.25, 0.36, 0.16), spread=0.03)
     leaves = soup.instance(Material.LEAVES, leaf, 0.4 * leaf)
     centre = frame[3] + np.array([0.3, 0.28, 0.75]) @ frame[:3]
@@ -196,7 +283,12 @@ def plant(soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float)
 
 
 def cartons(
-    soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float, depth: float = 0.6, levels: int = 3
+    soup: Soup,
+    rng: np.random.Generator,
+    frame: FloatArray,
+    width: float,
+    depth: float = 0.6,
+    levels: int = 3,
 ) -> None:
     """A stack of cartons of several sizes."""
     height = 0.0
@@ -205,9 +297,17 @@ def cartons(
         while width - left > 0.25:
             wide = min(float(rng.uniform(0.3, 0.8)), width - left)
             deep = depth * float(rng.uniform(0.8, 1.0))
-            paint = colour(rng, (0.62, 0.46, 0.30), (0.55, 0.40, 0.26), (0.72, 0.68, 0.62), spread=0.04)
+            paint = colour(
+                rng, (0.62, 0.46, 0.30), (0.55, 0.40, 0.26), (0.72, 0.68, 0.62), spread=0.04
+            )
             look = soup.instance(Material.CARTON, paint, colour(rng, *PAINTS), (wide, high))
-            solid(soup, frame, (left, 0, height), (wide - 0.01, deep, high * float(rng.uniform(0.75, 1.0))), look)
+            solid(
+                soup,
+                frame,
+                (left, 0, height),
+                (wide - 0.01, deep, high * float(rng.uniform(0.75, 1.0))),
+                look,
+            )
             left += wide
         height += high
 
@@ -223,7 +323,9 @@ def rack(soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float) 
         cartons(soup, rng, raised, (width - 0.16) * float(rng.uniform(0.4, 1.0)), 0.55, 1)
 
 
-def dining(soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float, depth: float) -> None:
+def dining(
+    soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float, depth: float
+) -> None:
     """A table with chairs on two sides."""
     _table(soup, rng, frame, width, depth)
     _things(soup, rng, frame, width, depth, 0.73)
@@ -235,32 +337,68 @@ def dining(soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float
             _legs(soup, frame, (left, left + 0.38), (front, front + 0.41), (0.04, 0.04, 0.42), seat)
 
 
-def _table(soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float, depth: float) -> None:
+def _table(
+    soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float, depth: float
+) -> None:
     board = wood(soup, rng)
     solid(soup, frame, (0, 0, 0.69), (width, depth, 0.04), board)
     _legs(soup, frame, (0.02, width - 0.08), (0.02, depth - 0.08), (0.06, 0.06, 0.69), board)
 
 
-def _legs(soup: Soup, frame: FloatArray, xs: Pair, ys: Pair, size: tuple[float, float, float], look: int) -> None:
+def _legs(
+    soup: Soup, frame: FloatArray, xs: Pair, ys: Pair, size: tuple[float, float, float], look: int
+) -> None:
     for x, y in product(xs, ys):
         solid(soup, frame, (x, y, 0), size, look)
 
 
-def _things(soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float, depth: float, height: float) -> None:
+def _things(
+    soup: Soup,
+    rng: np.random.Generator,
+    frame: FloatArray,
+    width: float,
+    depth: float,
+    height: float,
+) -> None:
     """Small boxes on a board."""
     left = float(rng.uniform(0.05, 0.3))
     while left < width - 0.2:
         size = tuple(float(side) for side in rng.uniform((0.06, 0.06, 0.03), (0.2, 0.2, 0.3)))
-        look = soup.instance(Material.CARTON, colour(rng, *PAINTS), colour(rng, *PAINTS), (size[0], size[2]))
-        solid(soup, frame, (left, float(rng.uniform(0.03, max(depth - 0.22, 0.04))), height), size, look)
+        look = soup.instance(
+            Material.CARTON, colour(rng, *PAINTS), colour(rng, *PAINTS), (size[0], size[2])
+        )
+        solid(
+            soup,
+            frame,
+            (left, float(rng.uniform(0.03, max(depth - 0.22, 0.04))), height),
+            size,
+            look,
+        )
         left += size[0] + float(rng.uniform(0.05, 0.7))
 
 
 # of each kind of room: what may stand at its walls
 STANDING: dict[str, tuple[tuple[Piece, float, float], ...]] = {  # piece, its width and depth
-    "living": ((sofa, 1.9, 0.65), (shelf, 1.2, 0.3), (chest, 1.3, 0.42), (plant, 0.6, 0.6), (shelf, 0.9, 0.3)),
-    "kitchen": ((counter, 2.4, 0.63), (cupboard, 1.1, 0.55), (counter, 1.8, 0.63), (chest, 1.0, 0.42)),
-    "office": ((desk, 1.4, 0.65), (shelf, 1.0, 0.3), (desk, 1.6, 0.65), (cupboard, 0.9, 0.55), (plant, 0.6, 0.6)),
+    "living": (
+        (sofa, 1.9, 0.65),
+        (shelf, 1.2, 0.3),
+        (chest, 1.3, 0.42),
+        (plant, 0.6, 0.6),
+        (shelf, 0.9, 0.3),
+    ),
+    "kitchen": (
+        (counter, 2.4, 0.63),
+        (cupboard, 1.1, 0.55),
+        (counter, 1.8, 0.63),
+        (chest, 1.0, 0.42),
+    ),
+    "office": (
+        (desk, 1.4, 0.65),
+        (shelf, 1.0, 0.3),
+        (desk, 1.6, 0.65),
+        (cupboard, 0.9, 0.55),
+        (plant, 0.6, 0.6),
+    ),
     "bedroom": ((bed, 2.0, 0.65), (cupboard, 1.6, 0.55), (chest, 0.9, 0.42), (desk, 1.2, 0.65)),
     "bath": ((chest, 1.0, 0.42), (cupboard, 0.7, 0.55)),
     "corridor": ((plant, 0.6, 0.6), (shelf, 0.8, 0.3)),
@@ -298,7 +436,9 @@ class Interior:
         rng, (x0, y0, x1, y1) = self.rng, room.area
         east, north = np.array([x1 - x0, 0.0, 0.0]), np.array([0.0, y1 - y0, 0.0])
         if room.kind in ("living", "bedroom", "office"):
-            floor = self.soup.instance(Material.BOARDS, colour(rng, *WOODS), None, (rng.uniform(0.07, 0.16),))
+            floor = self.soup.instance(
+                Material.BOARDS, colour(rng, *WOODS), None, (rng.uniform(0.07, 0.16),)
+            )
         else:
             side = float(rng.uniform(0.9, 1.3) if room.kind == "hall" else rng.uniform(0.2, 0.5))
             tone = colour(rng, (0.62, 0.60, 0.57), (0.50, 0.51, 0.53), (0.68, 0.58, 0.46))
@@ -309,7 +449,9 @@ class Interior:
         self._panel(np.array([x0, y0, room.height]), north, east, ceiling)
         tone = colour(rng, *_WALLS, spread=0.04)
         if room.kind == "bath":
-            wall = self.soup.instance(Material.TILES, tone, 0.8 * tone, (float(rng.uniform(0.1, 0.25)), 0.006))
+            wall = self.soup.instance(
+                Material.TILES, tone, 0.8 * tone, (float(rng.uniform(0.1, 0.25)), 0.006)
+            )
         else:
             papered = float(rng.uniform(0.1, 0.3)) if rng.random() < 0.2 else 0.0
             wall = self.soup.instance(Material.PLASTER, tone, self.skirting, (0.08, papered, 0.08))
@@ -321,7 +463,11 @@ class Interior:
     def _doorway(self, door: Rectangle) -> None:
         """Jambs, lintel and threshold of an opening."""
         x0, y0, x1, y1 = door
-        east, north, up = np.array([x1 - x0, 0, 0]), np.array([0, y1 - y0, 0]), np.array([0, 0, DOOR_HEIGHT])
+        east, north, up = (
+            np.array([x1 - x0, 0, 0]),
+            np.array([0, y1 - y0, 0]),
+            np.array([0, 0, DOOR_HEIGHT]),
+        )
         corner = np.array([x0, y0, 0.0])
         if x1 - x0 > WALL + 0.01:
             jambs = (corner, north), (corner + east + north, -north)
@@ -334,7 +480,9 @@ class Interior:
     def _panel(self, corner: FloatArray, along: FloatArray, up: FloatArray, look: int) -> None:
         """A parallelogram with vertices at most ``_STEP`` apart, textured in metres from its corner."""
         width, height = float(np.linalg.norm(along)), float(np.linalg.norm(up))
-        a, b = (np.linspace(0.0, 1.0, int(np.ceil(extent / _STEP)) + 1) for extent in (width, height))
+        a, b = (
+            np.linspace(0.0, 1.0, int(np.ceil(extent / _STEP)) + 1) for extent in (width, height)
+        )
         points = corner + a[None, :, None] * along + b[:, None, None] * up
         u, v = np.meshgrid(a * width, b * height + corner[2] * (up[2] > 0.0))
         self.soup.patch(points, np.stack([u, v], axis=2), look)
@@ -346,7 +494,12 @@ class Interior:
         ahead, up = np.array([np.cos(angle), np.sin(angle), 0.0]), np.array([0.0, 0.0, 1.0])
         for k, (start, end) in enumerate(pairwise([0.0, *np.ravel(openings), length])):
             low = DOOR_HEIGHT * (k % 2)
-            self._panel(np.array([x, y, low]) + end * ahead, (start - end) * ahead, (room.height - low) * up, wall)
+            self._panel(
+                np.array([x, y, low]) + end * ahead,
+                (start - end) * ahead,
+                (room.height - low) * up,
+                wall,
+            )
         doors = [(a - 0.35, b + 0.35) for a, b in openings]
         windows = self._windows(room, number)
         density = {"corridor": 0.15, "hall": 0.7, "bath": 0.6}.get(room.kind, 0.8)
@@ -383,12 +536,20 @@ class Interior:
         first, second = colour(rng, *PAINTS), colour(rng, *CLOTHS)
         kind = rng.random()
         if kind < 0.75:
-            look = self.soup.instance(Material.PICTURE, first, second, (across, high, float(rng.integers(3))))
+            look = self.soup.instance(
+                Material.PICTURE, first, second, (across, high, float(rng.integers(3)))
+            )
         elif kind < 0.9:
             look = self.soup.instance(Material.SCREEN, first, second, (across, high))
         else:
-            look = self.soup.instance(Material.PANE, np.array([0.72, 0.76, 0.78]), self.skirting, (across, high, 0.0))
-        low = (float(rng.uniform(0.0, width - across)), 0.0, 1.6 - 0.5 * high + float(rng.uniform(-0.1, 0.15)))
+            look = self.soup.instance(
+                Material.PANE, np.array([0.72, 0.76, 0.78]), self.skirting, (across, high, 0.0)
+            )
+        low = (
+            float(rng.uniform(0.0, width - across)),
+            0.0,
+            1.6 - 0.5 * high + float(rng.uniform(-0.1, 0.15)),
+        )
         plate(self.soup, frame, low, (across, 0.02, high), look, self.frame_look)
 
     def _windows(self, room: Room, number: int) -> list[tuple[float, float]]:
@@ -429,14 +590,18 @@ class Interior:
         if room.kind in ("living", "bedroom", "office") and free.min() > 0.2:
             size = np.minimum(free + 1.0, 2.6)
             tone, other = colour(rng, *CLOTHS), colour(rng, *PAINTS)
-            carpet = self.soup.instance(Material.CARPET, tone, other, (size[0], size[1], float(rng.uniform(0.2, 0.5))))
+            carpet = self.soup.instance(
+                Material.CARPET, tone, other, (size[0], size[1], float(rng.uniform(0.2, 0.5)))
+            )
             corner = np.array([*(low + 0.5 * (free - size)), 0.01])
             self.soup.quad(corner, np.array([size[0], 0, 0]), np.array([0, size[1], 0]), carpet)
         if free[0] > 0.8 and free[1] > 1.2 and rng.random() < 0.8:
             width, depth = min(free[0], 1.8), min(free[1] - 0.6, 0.9)
             x, y = low + 0.5 * (free - np.array([width, depth]))
             dining(self.soup, rng, frame_at(float(x), float(y), 0.0), width, depth)
-            self.obstacles.append((float(x), float(y) - 0.3, float(x) + width, float(y) + depth + 0.3))
+            self.obstacles.append(
+                (float(x), float(y) - 0.3, float(x) + width, float(y) + depth + 0.3)
+            )
 
     def _lamps(self, room: Room) -> None:
         """Flat lamps below the ceiling, about 3 m apart."""

@@ -50,7 +50,9 @@ def write_kitti_root(
     if lidar and world.T_camera_lidar is None:
         raise SequenceError(f"no LiDAR is carried through {world.options.route}: leave --lidar out")
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise SequenceError(f"{output} is {'not empty' if output.is_dir() else 'a file'}; remove it or choose another")
+        raise SequenceError(
+            f"{output} is {'not empty' if output.is_dir() else 'a file'}; remove it or choose another"
+        )
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(prefix=f".{output.name}.", dir=output.parent))
@@ -60,17 +62,25 @@ def write_kitti_root(
             _write_records(world, partial)
             if mesh:
                 vertices, triangles = world.mesh_world()
-                corners = np.ascontiguousarray(vertices, "<f4").view([(axis, "<f4") for axis in "xyz"])[:, 0]
+                corners = np.ascontiguousarray(vertices, "<f4").view(
+                    [(axis, "<f4") for axis in "xyz"]
+                )[:, 0]
                 write_ply(partial / "mesh.ply", Ply(corners, triangles.astype(np.int64)))
             partial.replace(output)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
     except OSError as error:
-        raise SequenceError(f"cannot write the simulated sequence to {output}: {error.strerror or error}") from error
+        raise SequenceError(
+            f"cannot write the simulated sequence to {output}: {error.strerror or error}"
+        ) from error
 
 
 def _write_frames(
-    world: SimulatedWorld, folder: Path, depth: bool, lidar: bool, progress: Callable[[int], None] | None
+    world: SimulatedWorld,
+    folder: Path,
+    depth: bool,
+    lidar: bool,
+    progress: Callable[[int], None] | None,
 ) -> None:
     """Images, and depth maps and scans if wanted."""
     for name in ["image_2"] + ["depth_2"] * depth + ["velodyne"] * lidar:
@@ -90,22 +100,33 @@ def _write_frames(
 def _write_records(world: SimulatedWorld, root: Path) -> None:
     """Calibration, times, poses, the camera and what was simulated."""
     sequence, camera, options = root / "sequences" / "sim", world.camera, world.options
-    projection = _row(np.column_stack([camera.K, np.zeros(3)]))  # the one camera stands for all four
+    projection = _row(
+        np.column_stack([camera.K, np.zeros(3)])
+    )  # the one camera stands for all four
     rows = [f"P{number}: {projection}" for number in range(4)]
     if world.T_camera_lidar is not None:
         rows.append(f"Tr: {_row(world.T_camera_lidar[:3])}")
     write_lines(sequence / "calib.txt", rows)
-    write_lines(sequence / "times.txt", [f"{index / options.rate:.6e}" for index in range(len(world))])
+    write_lines(
+        sequence / "times.txt", [f"{index / options.rate:.6e}" for index in range(len(world))]
+    )
     (root / "poses").mkdir()
     stamps = np.arange(len(world), dtype=np.float64)
     write_kitti(root / "poses" / "sim.txt", Trajectory(stamps, world.T_world_camera))
-    keys = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")} | {"fps": options.rate}
+    keys = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")} | {
+        "fps": options.rate
+    }
     if world.camera_height_m is not None:
         keys["camera_height_m"] = world.camera_height_m
     if options.readout_s:
         keys["readout_ms"] = 1e3 * options.readout_s
-    write_lines(root / "camera.yaml", [f"{key}: {value}" for key, value in keys.items()] + ["model: pinhole"])
-    write_lines(root / "simulation.json", [json.dumps({**asdict(options), "version": VERSION}, indent=2)])
+    write_lines(
+        root / "camera.yaml",
+        [f"{key}: {value}" for key, value in keys.items()] + ["model: pinhole"],
+    )
+    write_lines(
+        root / "simulation.json", [json.dumps({**asdict(options), "version": VERSION}, indent=2)]
+    )
 
 
 def write_image(path: Path, image: NDArray[np.uint8]) -> None:

@@ -9,10 +9,14 @@ from slam.simulation.geometry import FloatArray, Material, Soup
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def colour(rng: np.random.Generator, *choices: tuple[float, float, float], spread: float = 0.06) -> FloatArray:
+def colour(
+    rng: np.random.Generator, *choices: tuple[float, float, float], spread: float = 0.06
+) -> FloatArray:
     """One of the given colours, a little off, ``(3,)``."""
     base = np.array(choices[rng.integers(len(choices))])
-    return np.asarray(np.clip(base + rng.normal(0.0, spread) + rng.normal(0.0, 0.4 * spread, 3), 0.02, 1.0))
+    return np.asarray(
+        np.clip(base + rng.normal(0.0, spread) + rng.normal(0.0, 0.4 * spread, 3), 0.02, 1.0)
+    )
 
 
 def frame_at(x: float, y: float, angle: float, z: float = 0.0) -> FloatArray:
@@ -21,7 +25,9 @@ def frame_at(x: float, y: float, angle: float, z: float = 0.0) -> FloatArray:
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0], [x, y, z]])
 
 
-def box(soup: Soup, frame: FloatArray, low: FloatArray, high: FloatArray, instance: int, top: int = -1) -> None:
+def box(
+    soup: Soup, frame: FloatArray, low: FloatArray, high: FloatArray, instance: int, top: int = -1
+) -> None:
     """Four walls and a lid between two corners given in ``frame``; ``top`` may look different."""
     axis_x, axis_y, axis_z, origin = frame
     wx, wy, wz = high - low
@@ -33,7 +39,9 @@ def box(soup: Soup, frame: FloatArray, low: FloatArray, high: FloatArray, instan
     soup.quad(corner + wz * axis_z, wx * axis_x, wy * axis_y, instance if top < 0 else top)
 
 
-def tube(soup: Soup, base: FloatArray, tip: FloatArray, radii: tuple[float, float], instance: int) -> None:
+def tube(
+    soup: Soup, base: FloatArray, tip: FloatArray, radii: tuple[float, float], instance: int
+) -> None:
     """Six-sided tapering tube from ``base`` to ``tip``, ``(3,)`` each."""
     axis = (tip - base) / np.linalg.norm(tip - base)
     side = np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.7 else [0.0, 1.0, 0.0])
@@ -47,7 +55,9 @@ def tube(soup: Soup, base: FloatArray, tip: FloatArray, radii: tuple[float, floa
     soup.patch(points, np.stack([along, np.array([[0.0] * 7, [height] * 7])], axis=2), instance)
 
 
-def building(soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float, depth: float) -> None:
+def building(
+    soup: Soup, rng: np.random.Generator, frame: FloatArray, width: float, depth: float
+) -> None:
     """A house on the rectangle from the frame's origin to (width, depth), gabled or flat."""
     floor, floors = float(rng.uniform(2.7, 3.4)), int(rng.integers(1, 5))
     height = floors * floor + float(rng.uniform(0.4, 0.9))
@@ -61,7 +71,9 @@ def building(soup: Soup, rng: np.random.Generator, frame: FloatArray, width: flo
     style = float(rng.choice([0.0, 1.0, 2.0], p=[0.45, 0.35, 0.2]))  # plaster, brick, boards
     look = (floor, spacing, window_width, float(rng.uniform(1.1, 1.7)), style, height)
     wall = soup.instance(Material.WALL, plaster, trim, look)
-    tiles = colour(rng, (0.45, 0.22, 0.16), (0.30, 0.28, 0.28), (0.50, 0.33, 0.24), (0.24, 0.22, 0.24))
+    tiles = colour(
+        rng, (0.45, 0.22, 0.16), (0.30, 0.28, 0.28), (0.50, 0.33, 0.24), (0.24, 0.22, 0.24)
+    )
     roof = soup.instance(Material.ROOF, tiles)
     box(soup, frame, np.zeros(3), np.array([width, depth, height]), wall, top=roof)
     if rng.random() < 0.65:
@@ -73,13 +85,20 @@ def building(soup: Soup, rng: np.random.Generator, frame: FloatArray, width: flo
         box(soup, frame, np.array([x, -0.9, 0.0]), np.array([x + w, 0.0, top]), wall, top=roof)
     if rng.random() < 0.5:  # a chimney
         x, y = rng.uniform(0.2, 0.8) * width, rng.uniform(0.3, 0.7) * depth
-        stone = soup.instance(Material.WALL, 0.8 * plaster, trim, (99.0, 99.0, 0.0, 0.0, 1.0, height))
+        stone = soup.instance(
+            Material.WALL, 0.8 * plaster, trim, (99.0, 99.0, 0.0, 0.0, 1.0, height)
+        )
         low = np.array([x, y, height])
         box(soup, frame, low, low + np.array([0.8, 0.8, 3.0]), stone)
 
 
 def _gable(
-    soup: Soup, rng: np.random.Generator, frame: FloatArray, size: tuple[float, float, float], wall: int, roof: int
+    soup: Soup,
+    rng: np.random.Generator,
+    frame: FloatArray,
+    size: tuple[float, float, float],
+    wall: int,
+    roof: int,
 ) -> None:
     """A saddle roof with eaves over a box, its ridge along the longer or the shorter side."""
     width, depth, height = size
@@ -103,10 +122,21 @@ def _gable(
         soup.patch(np.stack([[a, b], [c, c]]), uv, wall)
 
 
-def tree(soup: Soup, rng: np.random.Generator, x: float, y: float, size: float, z: float = 0.0) -> None:
+def tree(
+    soup: Soup, rng: np.random.Generator, x: float, y: float, size: float, z: float = 0.0
+) -> None:
     """A trunk with a crown of lumpy balls, or a conifer of stacked cones."""
-    bark = soup.instance(Material.BARK, colour(rng, (0.32, 0.25, 0.19), (0.42, 0.38, 0.33), spread=0.04))
-    green = colour(rng, (0.20, 0.33, 0.12), (0.30, 0.40, 0.15), (0.15, 0.27, 0.14), (0.42, 0.40, 0.16), spread=0.03)
+    bark = soup.instance(
+        Material.BARK, colour(rng, (0.32, 0.25, 0.19), (0.42, 0.38, 0.33), spread=0.04)
+    )
+    green = colour(
+        rng,
+        (0.20, 0.33, 0.12),
+        (0.30, 0.40, 0.15),
+        (0.15, 0.27, 0.14),
+        (0.42, 0.40, 0.16),
+        spread=0.03,
+    )
     leaves = soup.instance(Material.LEAVES, green, green * rng.uniform(0.35, 0.6))
     foot = np.array([x, y, z])
     trunk = size * float(rng.uniform(0.28, 0.42))
@@ -122,7 +152,9 @@ def tree(soup: Soup, rng: np.random.Generator, x: float, y: float, size: float, 
         ball(soup, rng, centre, np.array([1.0, 1.0, 0.85]) * size * rng.uniform(0.16, 0.26), leaves)
 
 
-def ball(soup: Soup, rng: np.random.Generator, centre: FloatArray, radii: FloatArray, instance: int) -> None:
+def ball(
+    soup: Soup, rng: np.random.Generator, centre: FloatArray, radii: FloatArray, instance: int
+) -> None:
     """A lumpy ellipsoid of 6 x 9 faces."""
     polar, around = np.linspace(0.0, np.pi, 7), np.linspace(0.0, 2.0 * np.pi, 10)
     sin_polar = np.sin(polar)[:, None]
@@ -131,7 +163,10 @@ def ball(soup: Soup, rng: np.random.Generator, centre: FloatArray, radii: FloatA
     lump = rng.uniform(0.75, 1.2, (7, 10, 1))
     lump[:, -1], lump[0], lump[-1] = lump[:, 0], 1.0, 1.0
     points = centre + unit * lump * radii
-    uv = np.stack([np.broadcast_to(around * radii[0], (7, 10)), np.tile(polar[:, None] * radii[2], 10)], axis=2)
+    uv = np.stack(
+        [np.broadcast_to(around * radii[0], (7, 10)), np.tile(polar[:, None] * radii[2], 10)],
+        axis=2,
+    )
     soup.patch(points, uv, instance)
 
 
@@ -147,17 +182,28 @@ def hedge(soup: Soup, rng: np.random.Generator, frame: FloatArray, length: float
         look, thick = soup.instance(Material.FENCE, wood, 0.35 * wood, (gap, height)), 0.06
     else:
         stone = colour(rng, (0.58, 0.55, 0.50), (0.52, 0.38, 0.30))
-        look, thick = soup.instance(Material.WALL, stone, stone, (99.0, 99.0, 0.0, 0.0, 1.0, height)), 0.3
+        look, thick = (
+            soup.instance(Material.WALL, stone, stone, (99.0, 99.0, 0.0, 0.0, 1.0, height)),
+            0.3,
+        )
     box(soup, frame, np.zeros(3), np.array([length, thick, height]), look)
 
 
 def lamp(soup: Soup, rng: np.random.Generator, x: float, y: float, towards: FloatArray) -> None:
     """A street lamp whose arm reaches ``towards`` the road, a plan direction ``(2,)``."""
-    steel = soup.instance(Material.METAL, colour(rng, (0.42, 0.44, 0.45), (0.20, 0.26, 0.22), spread=0.04))
+    steel = soup.instance(
+        Material.METAL, colour(rng, (0.42, 0.44, 0.45), (0.20, 0.26, 0.22), spread=0.04)
+    )
     foot, height = np.array([x, y, 0.0]), float(rng.uniform(5.0, 8.0))
     tube(soup, foot, foot + height * UP, (0.10, 0.06), steel)
     reach = np.array([towards[0], towards[1], 0.12])
-    tube(soup, foot + height * UP, foot + height * UP + reach * rng.uniform(0.9, 1.8), (0.05, 0.09), steel)
+    tube(
+        soup,
+        foot + height * UP,
+        foot + height * UP + reach * rng.uniform(0.9, 1.8),
+        (0.05, 0.09),
+        steel,
+    )
 
 
 def sign(soup: Soup, rng: np.random.Generator, x: float, y: float, facing: float) -> None:
@@ -165,7 +211,9 @@ def sign(soup: Soup, rng: np.random.Generator, x: float, y: float, facing: float
     steel = soup.instance(Material.METAL, colour(rng, (0.55, 0.56, 0.57), spread=0.03))
     foot, height = np.array([x, y, 0.0]), float(rng.uniform(2.1, 2.7))
     tube(soup, foot, foot + (height + 0.3) * UP, (0.04, 0.04), steel)
-    paint = colour(rng, (0.70, 0.08, 0.08), (0.08, 0.20, 0.60), (0.85, 0.65, 0.08), (0.10, 0.40, 0.20))
+    paint = colour(
+        rng, (0.70, 0.08, 0.08), (0.08, 0.20, 0.60), (0.85, 0.65, 0.08), (0.10, 0.40, 0.20)
+    )
     half = float(rng.uniform(0.3, 0.45))
     kind = float(rng.integers(3))
     plate = soup.instance(Material.SIGN, paint, np.array([0.92, 0.92, 0.90]), (half, kind))
@@ -176,7 +224,9 @@ def sign(soup: Soup, rng: np.random.Generator, x: float, y: float, facing: float
 
 def railing(soup: Soup, rng: np.random.Generator, frame: FloatArray, length: float) -> None:
     """Posts and bars along the frame's x axis, which one sees through."""
-    tone = colour(rng, (0.55, 0.56, 0.57), (0.18, 0.20, 0.20), (0.72, 0.72, 0.70), (0.42, 0.30, 0.20))
+    tone = colour(
+        rng, (0.55, 0.56, 0.57), (0.18, 0.20, 0.20), (0.72, 0.72, 0.70), (0.42, 0.30, 0.20)
+    )
     steel = soup.instance(Material.METAL, tone)
     height, spacing = float(rng.uniform(0.6, 1.3)), float(rng.choice([0.15, 0.3, 1.5, 2.5]))
     radius = float(rng.uniform(0.015, 0.05))
@@ -191,7 +241,9 @@ def railing(soup: Soup, rng: np.random.Generator, frame: FloatArray, length: flo
 
 def wire_fence(soup: Soup, rng: np.random.Generator, frame: FloatArray, length: float) -> None:
     """Wooden posts and the wires between them along the frame's x axis."""
-    wood = soup.instance(Material.BARK, colour(rng, (0.42, 0.36, 0.29), (0.55, 0.52, 0.48), spread=0.03))
+    wood = soup.instance(
+        Material.BARK, colour(rng, (0.42, 0.36, 0.29), (0.55, 0.52, 0.48), spread=0.03)
+    )
     wire = soup.instance(Material.METAL, colour(rng, (0.5, 0.5, 0.5), spread=0.03))
     height = float(rng.uniform(0.9, 1.4))
     posts = np.arange(0.0, length, float(rng.uniform(2.0, 4.0)))
@@ -204,7 +256,9 @@ def wire_fence(soup: Soup, rng: np.random.Generator, frame: FloatArray, length: 
             tube(soup, up + here * frame[0], up + there * frame[0], (0.008, 0.008), wire)
 
 
-def barrier(soup: Soup, rng: np.random.Generator, frame: FloatArray, length: float, concrete: bool) -> None:
+def barrier(
+    soup: Soup, rng: np.random.Generator, frame: FloatArray, length: float, concrete: bool
+) -> None:
     """A wall of concrete, or a steel rail on posts, along the frame's x axis in pieces of 4 m."""
     grey = colour(rng, (0.62, 0.61, 0.58), (0.5, 0.5, 0.5), spread=0.04)
     look = soup.instance(Material.GRAVEL if concrete else Material.METAL, grey, 0.8 * grey)
@@ -221,18 +275,28 @@ def barrier(soup: Soup, rng: np.random.Generator, frame: FloatArray, length: flo
 
 def post(soup: Soup, rng: np.random.Generator, x: float, y: float) -> None:
     """A bollard, a guide post or a mast."""
-    steel = soup.instance(Material.METAL, colour(rng, (0.85, 0.85, 0.82), (0.30, 0.28, 0.26), (0.50, 0.50, 0.52)))
+    steel = soup.instance(
+        Material.METAL, colour(rng, (0.85, 0.85, 0.82), (0.30, 0.28, 0.26), (0.50, 0.50, 0.52))
+    )
     foot, radius = np.array([x, y, 0.0]), float(rng.uniform(0.03, 0.12))
     tube(soup, foot, foot + float(rng.choice([1.0, 3.0, 7.0])) * UP, (radius, 0.8 * radius), steel)
 
 
 def person(soup: Soup, rng: np.random.Generator, x: float, y: float) -> None:
     """Legs, body and head of somebody who stands."""
-    clothes = [colour(rng, (0.2, 0.2, 0.25), (0.6, 0.2, 0.2), (0.7, 0.7, 0.68), (0.2, 0.3, 0.55)) for _ in range(2)]
+    clothes = [
+        colour(rng, (0.2, 0.2, 0.25), (0.6, 0.2, 0.2), (0.7, 0.7, 0.68), (0.2, 0.3, 0.55))
+        for _ in range(2)
+    ]
     trousers, coat = (soup.instance(Material.METAL, shade) for shade in clothes)
-    skin = soup.instance(Material.METAL, colour(rng, (0.75, 0.58, 0.47), (0.45, 0.32, 0.25), spread=0.03))
+    skin = soup.instance(
+        Material.METAL, colour(rng, (0.75, 0.58, 0.47), (0.45, 0.32, 0.25), spread=0.03)
+    )
     size = float(rng.uniform(0.85, 1.08))
-    foot, side = np.array([x, y, 0.1]), 0.12 * np.array([*np.sin(rng.uniform(0, 7) + np.array([0, np.pi / 2])), 0.0])
+    foot, side = (
+        np.array([x, y, 0.1]),
+        0.12 * np.array([*np.sin(rng.uniform(0, 7) + np.array([0, np.pi / 2])), 0.0]),
+    )
     for leg in (foot + side, foot - side):
         tube(soup, leg, foot + 0.5 * (leg - foot) + 0.85 * size * UP, (0.08, 0.11), trousers)
     tube(soup, foot + 0.8 * size * UP, foot + 1.45 * size * UP, (0.17, 0.21), coat)
@@ -243,8 +307,20 @@ def bonnet(soup: Soup, rng: np.random.Generator, below: float, height_m: float) 
     """The bonnet before a camera, in its frame; its far edge is seen at the slope ``below`` the axis."""
     far = float(min(rng.uniform(1.1, 2.0), 0.6 * height_m / max(below, 0.05)))
     x, z = np.meshgrid(np.linspace(-1.1, 1.1, 15), np.linspace(0.25, far, 8))
-    y = below * far + 0.12 * (far - z) ** 2 + 0.10 * x**2 + 0.25 * np.clip(np.abs(x) - 0.7, 0.0, None)
-    lacquer = colour(rng, (0.7, 0.7, 0.72), (0.08, 0.08, 0.09), (0.35, 0.36, 0.38), (0.5, 0.08, 0.08), (0.1, 0.16, 0.4))
+    y = (
+        below * far
+        + 0.12 * (far - z) ** 2
+        + 0.10 * x**2
+        + 0.25 * np.clip(np.abs(x) - 0.7, 0.0, None)
+    )
+    lacquer = colour(
+        rng,
+        (0.7, 0.7, 0.72),
+        (0.08, 0.08, 0.09),
+        (0.35, 0.36, 0.38),
+        (0.5, 0.08, 0.08),
+        (0.1, 0.16, 0.4),
+    )
     paint = soup.instance(Material.METAL, lacquer)
     soup.patch(np.stack([x, y, z], axis=2), np.stack([x, z], axis=2), paint)
 
@@ -257,10 +333,25 @@ def car(soup: Soup, rng: np.random.Generator, frame: FloatArray) -> None:
     )  # fmt: skip
     paint = soup.instance(Material.PAINT, lacquer, 0.4 * lacquer, (1.0,))
     glass = soup.instance(Material.GLASS, np.array([0.10, 0.12, 0.14]), 0.8 * lacquer, (1.0,))
-    tyre = soup.instance(Material.TYRE, np.array([0.05, 0.05, 0.05]), np.array([0.5, 0.5, 0.5]), (0.32,))
-    length, half, van = float(rng.uniform(3.7, 4.7)), float(rng.uniform(0.82, 0.92)), rng.random() < 0.2
-    waist, roof = float(rng.uniform(0.82, 0.98)), float(rng.uniform(1.38, 1.6)) + (0.45 if van else 0.0)
-    box(soup, frame, np.array([-length / 2, -half, 0.25]), np.array([length / 2, half, waist]), paint)
+    tyre = soup.instance(
+        Material.TYRE, np.array([0.05, 0.05, 0.05]), np.array([0.5, 0.5, 0.5]), (0.32,)
+    )
+    length, half, van = (
+        float(rng.uniform(3.7, 4.7)),
+        float(rng.uniform(0.82, 0.92)),
+        rng.random() < 0.2,
+    )
+    waist, roof = (
+        float(rng.uniform(0.82, 0.98)),
+        float(rng.uniform(1.38, 1.6)) + (0.45 if van else 0.0),
+    )
+    box(
+        soup,
+        frame,
+        np.array([-length / 2, -half, 0.25]),
+        np.array([length / 2, half, waist]),
+        paint,
+    )
     hood = float(rng.uniform(0.10, 0.16) if van else rng.uniform(0.2, 0.3))
     low = (-0.48 * length, (0.5 - hood) * length)
     high = (low[0] + (0.1 if van else rng.uniform(0.2, 0.8)), low[1] - rng.uniform(0.5, 0.8))

@@ -46,17 +46,29 @@ class SimulationOptions:
     def __post_init__(self) -> None:
         """Refuse invalid options by a ``SequenceError`` that names one."""
         if self.route not in WORLD_KINDS:
-            raise SequenceError(f"route must be one of {', '.join(WORLD_KINDS)}; got {self.route!r}")
-        place, known = ("rooms", get_args(RoomHazard)) if self.route == "rooms" else ("a street", get_args(Hazard))
+            raise SequenceError(
+                f"route must be one of {', '.join(WORLD_KINDS)}; got {self.route!r}"
+            )
+        place, known = (
+            ("rooms", get_args(RoomHazard))
+            if self.route == "rooms"
+            else ("a street", get_args(Hazard))
+        )
         for hazard in self.hazards:
             if hazard not in known:
                 raise SequenceError(f"hazards of {place} are {', '.join(known)}; got {hazard!r}")
         if self.route != "rooms" and (self.motion is not None or self.rate != STREET_RATE):
-            raise SequenceError(f"a street is driven at {STREET_RATE:g} frames a second: motion and rate are of rooms")
+            raise SequenceError(
+                f"a street is driven at {STREET_RATE:g} frames a second: motion and rate are of rooms"
+            )
         if self.motion not in (None, *get_args(Motion)):
-            raise SequenceError(f"motion must be one of {', '.join(get_args(Motion))}; got {self.motion!r}")
+            raise SequenceError(
+                f"motion must be one of {', '.join(get_args(Motion))}; got {self.motion!r}"
+            )
         if not _RATES[0] <= self.rate <= _RATES[1]:
-            raise SequenceError(f"rate must be {_RATES[0]:g} to {_RATES[1]:g} frames a second; got {self.rate:g}")
+            raise SequenceError(
+                f"rate must be {_RATES[0]:g} to {_RATES[1]:g} frames a second; got {self.rate:g}"
+            )
         if self.seed < 0:
             raise SequenceError(f"seed must be 0 or more; got {self.seed}")
         if self.frames > MOST_FRAMES:
@@ -86,8 +98,12 @@ class Variety:
     steepness: float  # of hills at most, rise over run
     wavelength_m: float  # of hills
     fov_deg: float  # of the camera, horizontal
-    aspect: float | None  # of the camera's own image, which is shrunk to the size asked for; None: of that size
-    centre: tuple[float, float]  # of the lens beside the middle of the image, shares of its width and height
+    aspect: (
+        float | None
+    )  # of the camera's own image, which is shrunk to the size asked for; None: of that size
+    centre: tuple[
+        float, float
+    ]  # of the lens beside the middle of the image, shares of its width and height
     height_m: float  # of the camera above the road at rest
     pitch: float  # of the camera, downwards, radians
     roll: float  # of the camera about its axis, clockwise, radians

@@ -22,7 +22,15 @@ from slam.simulation.house import Interior
 from slam.simulation.objects import person
 from slam.simulation.options import Motion, SimulationOptions
 from slam.simulation.texture import GLOWING
-from slam.simulation.world import SHUTTER, Hits, SimulatedWorld, Surface, place_rays, square_camera, through_lens
+from slam.simulation.world import (
+    SHUTTER,
+    Hits,
+    SimulatedWorld,
+    Surface,
+    place_rays,
+    square_camera,
+    through_lens,
+)
 
 CELL = 0.08  # metres
 _CLEAR_M = 0.44  # of a path's cells from walls and furniture, which begin up to a cell nearer
@@ -38,7 +46,11 @@ STILL_S = 3.0
 _USUAL_FOV_DEG, _VARIED_FOV_DEG = 65.0, (55.0, 100.0)
 _PEOPLE, _AHEAD_S, _NEAREST_M = 6, 3.5, 0.7  # the first of them walks ahead of the camera
 _GREY = 0.4  # brightness that exposure aims at
-_LONGEST_S, _METER_S, _METERED = 0.02, 0.1, 12  # exposure in the light; the meter's period, and how often it is read
+_LONGEST_S, _METER_S, _METERED = (
+    0.02,
+    0.1,
+    12,
+)  # exposure in the light; the meter's period, and how often it is read
 _RAYS = 48  # around a corner
 _BOUNCES = 3
 _ALBEDO = 0.55
@@ -62,15 +74,22 @@ class Floor:
         free = np.zeros((shape[1], shape[0]), dtype=np.uint8)
         for rectangles, value in (([*map(tuple, areas), *house.doors], 1), (interior.obstacles, 0)):
             for x0, y0, x1, y1 in rectangles:
-                low, high = ((np.array(corner) - self._origin) / CELL for corner in ((x0, y0), (x1, y1)))
+                low, high = (
+                    (np.array(corner) - self._origin) / CELL for corner in ((x0, y0), (x1, y1))
+                )
                 outwards = 0.0 if value else 1.0
                 first = np.ceil(low - 0.5 - 0.5 * outwards).astype(int)
                 last = np.floor(high + 0.5 + 0.5 * outwards).astype(int)
                 free[first[1] : last[1], first[0] : last[0]] = value
-        self._clearance = np.asarray(cv2.distanceTransform(free, cv2.DIST_L2, 5) * CELL, dtype=np.float64)
+        self._clearance = np.asarray(
+            cv2.distanceTransform(free, cv2.DIST_L2, 5) * CELL, dtype=np.float64
+        )
         self._cells = np.argwhere(self._clearance >= _CLEAR_M)[:, ::-1]  # (C, 2), column and row
         self._graph = self._connect()
-        rng, (_, part) = np.random.default_rng([seed, 52]), connected_components(self._graph, directed=False)
+        rng, (_, part) = (
+            np.random.default_rng([seed, 52]),
+            connected_components(self._graph, directed=False),
+        )
         centres = self._centres(self._cells)
         roomy = (part == np.bincount(part).argmax()) & (self.clearance(centres) >= _PLACE_CLEAR_M)
         chosen: list[int] = []
@@ -129,7 +148,9 @@ class Floor:
     @functools.lru_cache(maxsize=64)  # noqa: B019 - a floor lives as long as its world
     def _from(self, start: int) -> tuple[FloatArray, IntArray]:
         """Distance of all cells from a place, and the cell before each on the way."""
-        length, before = dijkstra(self._graph, directed=False, indices=self._at[start], return_predecessors=True)
+        length, before = dijkstra(
+            self._graph, directed=False, indices=self._at[start], return_predecessors=True
+        )
         return length, before
 
 
@@ -180,13 +201,27 @@ class Carried:
         side = np.clip(side, -free, free)
         unsteady = np.deg2rad(gait.tremor_deg)
         wander = np.deg2rad(gait.wander_deg) * (0.3 + 0.7 * moved)
-        tremors = [unsteady * (_unrest(rng, count, 0.05) + 0.7 * _unrest(rng, count, 0.25)) for _ in range(3)]
+        tremors = [
+            unsteady * (_unrest(rng, count, 0.05) + 0.7 * _unrest(rng, count, 0.25))
+            for _ in range(3)
+        ]
         height = rng.uniform(*gait.height_m) + gait.climb_m * _unrest(rng, count, 1.5)
         z = height + moved * gait.bob_m * np.cos(step)
         yaw = yaw + wander * _unrest(rng, count, 0.9) + tremors[0]
-        pitch = pitch + np.deg2rad(gait.pitch_deg) + wander / 3.0 * _unrest(rng, count, 0.9) + tremors[1]
-        roll = 4.0 * unsteady * _unrest(rng, count, 0.8) + 0.3 * moved * gait.sway_m * np.cos(0.5 * step) + tremors[2]
-        self._channels = np.stack([x + side * np.sin(yaw), y - side * np.cos(yaw), z, yaw, pitch, roll], axis=1)
+        pitch = (
+            pitch
+            + np.deg2rad(gait.pitch_deg)
+            + wander / 3.0 * _unrest(rng, count, 0.9)
+            + tremors[1]
+        )
+        roll = (
+            4.0 * unsteady * _unrest(rng, count, 0.8)
+            + 0.3 * moved * gait.sway_m * np.cos(0.5 * step)
+            + tremors[2]
+        )
+        self._channels = np.stack(
+            [x + side * np.sin(yaw), y - side * np.cos(yaw), z, yaw, pitch, roll], axis=1
+        )
 
     def at(self, seconds: FloatArray) -> FloatArray:
         """The channels at times ``(N,)``, ``(6, N)``."""
@@ -199,15 +234,22 @@ class Carried:
         level, zero = np.cos(pitch), np.zeros_like(x)
         forward = np.stack([np.cos(yaw) * level, np.sin(yaw) * level, np.sin(pitch)], axis=1)
         right = np.stack([np.sin(yaw), -np.cos(yaw), zero], axis=1)
-        upright = se3.make(np.stack([right, np.cross(forward, right), forward], axis=2), np.stack([x, y, z], axis=1))
-        return upright @ se3.from_rotation_vector(np.stack([zero, zero, roll], axis=1), np.zeros((len(x), 3)))
+        upright = se3.make(
+            np.stack([right, np.cross(forward, right), forward], axis=2),
+            np.stack([x, y, z], axis=1),
+        )
+        return upright @ se3.from_rotation_vector(
+            np.stack([zero, zero, roll], axis=1), np.zeros((len(x), 3))
+        )
 
 
 def _unrest(rng: np.random.Generator, count: int, seconds: float) -> FloatArray:
     """Noise of unit deviation within two and a half that is smooth over a time, ``(count,)``."""
     sigma = seconds * CLOCK
     margin = int(4.0 * sigma)
-    noise = gaussian_filter1d(rng.standard_normal(count + 2 * margin), sigma)[margin : margin + count]
+    noise = gaussian_filter1d(rng.standard_normal(count + 2 * margin), sigma)[
+        margin : margin + count
+    ]
     return np.asarray(np.clip(noise * np.sqrt(3.54 * sigma), -2.5, 2.5))
 
 
@@ -235,7 +277,11 @@ class _Walk:
         """Walk to another place, rather a near one in a room that was seldom visited."""
         floor, rng = self._floor, self._rng
         self._visits[floor.room[self._place]] += 1
-        longing = floor.lengths(self._place) + 8.0 * self._visits[floor.room] + rng.uniform(0.0, 8.0, len(floor.places))
+        longing = (
+            floor.lengths(self._place)
+            + 8.0 * self._visits[floor.room]
+            + rng.uniform(0.0, 8.0, len(floor.places))
+        )
         longing[self._place] = np.inf
         goal = int(np.argmin(longing))
         path = floor.path(self._place, goal)
@@ -244,7 +290,11 @@ class _Walk:
         path = np.stack([np.interp(along, length, axis) for axis in path.T], axis=1)
         ahead = np.minimum(np.arange(len(path)) + 25, len(path) - 1)
         ahead[-25:] = len(path) - 1
-        behind = np.minimum(np.arange(len(path)), len(path) - 26) if len(path) > 26 else np.zeros(len(path), dtype=int)
+        behind = (
+            np.minimum(np.arange(len(path)), len(path) - 26)
+            if len(path) > 26
+            else np.zeros(len(path), dtype=int)
+        )
         towards = path[ahead] - path[behind]
         heading = np.unwrap(np.arctan2(towards[:, 1], towards[:, 0]))
         self._turn_by(float((heading[0] - self._yaw + np.pi) % (2.0 * np.pi) - np.pi))
@@ -256,12 +306,17 @@ class _Walk:
         at = np.interp(ticks, arrival, np.arange(len(path)))
         rows = np.arange(len(path))
         track = [np.interp(at, rows, channel) for channel in (path[:, 0], path[:, 1], heading)]
-        self._add(np.stack([*track, np.zeros_like(at)], axis=1), np.interp(at, rows, pace) / self._gait.speed)
+        self._add(
+            np.stack([*track, np.zeros_like(at)], axis=1),
+            np.interp(at, rows, pace) / self._gait.speed,
+        )
         self._yaw, self._place = float(heading[-1]), goal
 
     def _look_round(self) -> None:
         """Turn on the spot."""
-        self._turn_by(float(self._rng.choice([-1.0, 1.0]) * np.deg2rad(self._rng.uniform(60.0, 360.0))))
+        self._turn_by(
+            float(self._rng.choice([-1.0, 1.0]) * np.deg2rad(self._rng.uniform(60.0, 360.0)))
+        )
 
     def _sweep(self) -> None:
         """Look left and right, up and down."""
@@ -281,7 +336,10 @@ class _Walk:
 
     def _stay(self, yaw: FloatArray, pitch: FloatArray) -> None:
         x, y = self._parts[-1][-1, :2] if self._parts else self._floor.places[self._place]
-        self._add(np.stack([np.full_like(yaw, x), np.full_like(yaw, y), yaw, pitch], axis=1), np.zeros_like(yaw))
+        self._add(
+            np.stack([np.full_like(yaw, x), np.full_like(yaw, y), yaw, pitch], axis=1),
+            np.zeros_like(yaw),
+        )
 
     def _add(self, part: FloatArray, moved: FloatArray) -> None:
         self._parts.append(part)
@@ -299,17 +357,26 @@ class SimulatedRooms(SimulatedWorld):
         floor = Floor(self._interior, options.seed)
         seconds = options.frames / options.rate + _AHEAD_S + 1.0
         motions = _PEOPLE if "people" in options.hazards else 1
-        self._carried = Carried(floor, options.motion or "walk", seconds, options.rate, options.seed)
+        self._carried = Carried(
+            floor, options.motion or "walk", seconds, options.rate, options.seed
+        )
         self._walks = [
-            Carried(floor, "walk", seconds, options.rate, options.seed + 1000 * k) for k in range(1, motions)
+            Carried(floor, "walk", seconds, options.rate, options.seed + 1000 * k)
+            for k in range(1, motions)
         ]
         rng = np.random.default_rng([options.seed, 57])
-        crowd = [lambda soup: person(soup, rng, 0.0, 0.0)] * _PEOPLE  # around their own origins, looking along x
+        crowd = [
+            lambda soup: person(soup, rng, 0.0, 0.0)
+        ] * _PEOPLE  # around their own origins, looking along x
         self._people = Moving(rng, crowd) if "people" in options.hazards else None
         fov = options.fov_deg or _USUAL_FOV_DEG
         if options.varied and options.fov_deg is None:
-            fov = float(np.exp(np.random.default_rng([options.seed, 55]).uniform(*np.log(_VARIED_FOV_DEG))))
-        T_scene_camera = self._carried.poses(self._moments(np.arange(options.frames) / options.rate, options))
+            fov = float(
+                np.exp(np.random.default_rng([options.seed, 55]).uniform(*np.log(_VARIED_FOV_DEG)))
+            )
+        T_scene_camera = self._carried.poses(
+            self._moments(np.arange(options.frames) / options.rate, options)
+        )
         super().__init__(options, square_camera(options.width, options.height, fov), T_scene_camera)
 
     def _build(self) -> Mesh:
@@ -331,8 +398,13 @@ class SimulatedRooms(SimulatedWorld):
         offsets = np.zeros((1, 1))
         if "blur" in options.hazards:
             turned = np.diff(self._T_scene_camera[max(index - 1, 0) : index + 2, :3, 2], axis=0)
-            open_s = min(_LONGEST_S * self._gain(index) / self._usual_gain, 2.0 * SHUTTER * 0.9 / options.rate)
-            blurred_px = np.linalg.norm(turned, axis=1).max() * open_s * options.rate * self.camera.fx
+            open_s = min(
+                _LONGEST_S * self._gain(index) / self._usual_gain,
+                2.0 * SHUTTER * 0.9 / options.rate,
+            )
+            blurred_px = (
+                np.linalg.norm(turned, axis=1).max() * open_s * options.rate * self.camera.fx
+            )
             samples = int(np.clip(blurred_px / 4.0, 3, 12))
             offsets = offsets + open_s * ((np.arange(samples)[:, None] + 0.5) / samples - 0.5)
         if options.readout_s:
@@ -346,16 +418,26 @@ class SimulatedRooms(SimulatedWorld):
         if self._people is None:
             return []
         now = index / self.options.rate
-        T_scene_people = [_standing(self._carried, now + _AHEAD_S), *(_standing(walk, now) for walk in self._walks)]
+        T_scene_people = [
+            _standing(self._carried, now + _AHEAD_S),
+            *(_standing(walk, now) for walk in self._walks),
+        ]
         camera = self._T_scene_camera[index, :2, 3]
         far = [np.linalg.norm(T[:2, 3] - camera) > _NEAREST_M for T in T_scene_people]
-        return self._people.placed({number: T for number, T in enumerate(T_scene_people) if far[number]})
+        return self._people.placed(
+            {number: T for number, T in enumerate(T_scene_people) if far[number]}
+        )
 
     def _background(self, directions: Float32Array) -> Float32Array:
         return np.zeros_like(directions)
 
     def _shade(
-        self, surfaces: list[Surface], number: int, hits: Hits, rays: Float32Array, pixels: NDArray[np.int64]
+        self,
+        surfaces: list[Surface],
+        number: int,
+        hits: Hits,
+        rays: Float32Array,
+        pixels: NDArray[np.int64],
     ) -> Float32Array:
         rgb = surfaces[number].unlit(hits, self.camera.fx)
         if number > 0:  # people are as bright as what is below them
@@ -363,14 +445,22 @@ class SimulatedRooms(SimulatedWorld):
             down[:, :3] += rays[:, 3:] * hits.depth[:, None]
             down[:, 3:] = (0.0, 0.0, -1.0)
             hits_below = self._still.cast(down)
-            below = np.minimum(hits_below["primitive_ids"].astype(np.int64), self._irradiance.shape[1] - 1)
-            return np.asarray(rgb * self._irradiance[:, below].mean(axis=0) * (0.85 + 0.15 * hits.normals[2]))
+            below = np.minimum(
+                hits_below["primitive_ids"].astype(np.int64), self._irradiance.shape[1] - 1
+            )
+            return np.asarray(
+                rgb * self._irradiance[:, below].mean(axis=0) * (0.85 + 0.15 * hits.normals[2])
+            )
         return np.asarray(rgb * self._light(hits.triangle, hits.barycentric))
 
     def _light(self, triangle: NDArray[np.int64], barycentric: Float32Array) -> Float32Array:
         """Irradiance at points of triangles ``(N,)``; of what glows, its own light."""
         corners = np.take(self._irradiance, triangle, axis=1)
-        light = corners[0] + barycentric[0] * (corners[1] - corners[0]) + barycentric[1] * (corners[2] - corners[0])
+        light = (
+            corners[0]
+            + barycentric[0] * (corners[1] - corners[0])
+            + barycentric[1] * (corners[2] - corners[0])
+        )
         glow = _GLOW[np.take(self._still.mesh.material, triangle)]
         return np.asarray(np.where(glow > 0.0, glow, light))
 
@@ -380,7 +470,9 @@ class SimulatedRooms(SimulatedWorld):
         rgb = through_lens(rgb * np.float32(gain))
         if "exposure" in self.options.hazards:
             rng = np.random.default_rng([self.options.seed, 56, index])
-            rgb = rgb + rng.standard_normal(rgb.shape, dtype=np.float32) * np.float32(0.008 * np.sqrt(gain))
+            rgb = rgb + rng.standard_normal(rgb.shape, dtype=np.float32) * np.float32(
+                0.008 * np.sqrt(gain)
+            )
         return rgb
 
     def _gain(self, index: int) -> float:
@@ -389,7 +481,12 @@ class SimulatedRooms(SimulatedWorld):
             return self._usual_gain
         last = int(index / self.options.rate / _METER_S)
         read = np.array([self._brightness(max(last - k, 0)) for k in range(_METERED)])
-        return float(_GREY / max((read * np.exp(-_METER_S * np.arange(_METERED) / 0.35)).sum() / _METER_WEIGHT, 0.06))
+        return float(
+            _GREY
+            / max(
+                (read * np.exp(-_METER_S * np.arange(_METERED) / 0.35)).sum() / _METER_WEIGHT, 0.06
+            )
+        )
 
     @functools.cached_property
     def _usual_gain(self) -> float:
@@ -424,7 +521,9 @@ def _illuminated(seed: int, some_are_dim: bool) -> Float32Array:
     interior = _interior(seed)
     lights = interior.lights.copy()
     if some_are_dim:
-        strength = np.exp(np.random.default_rng([seed, 54]).uniform(-1.5, 0.5, len(interior.house.rooms)))
+        strength = np.exp(
+            np.random.default_rng([seed, 54]).uniform(-1.5, 0.5, len(interior.house.rooms))
+        )
         for room, factor in zip(interior.house.rooms, strength):
             lights[room.contains(lights[:, :2]), 3] *= factor
     surface, mesh = Surface(interior.mesh), interior.mesh
@@ -437,7 +536,9 @@ def _illuminated(seed: int, some_are_dim: bool) -> Float32Array:
         np.add.at(normal, corner, mesh.normals.T)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     middle /= np.maximum(uses, 1)
-    points = mesh.vertices + 0.12 * (middle - mesh.vertices) + 0.015 * normal  # out of the corner, off the surface
+    points = (
+        mesh.vertices + 0.12 * (middle - mesh.vertices) + 0.015 * normal
+    )  # out of the corner, off the surface
     direct = np.zeros(len(points))  # the light of the lamps that are seen
     for x, y, z, strength in lights:
         towards = np.array([x, y, z]) - points
@@ -445,7 +546,9 @@ def _illuminated(seed: int, some_are_dim: bool) -> Float32Array:
         cosine = (towards * normal).sum(axis=1) / np.maximum(distance, 1e-9)
         near = np.flatnonzero((distance < _REACH_M) & (cosine > 0.0))
         rays = np.hstack([points[near], towards[near]]).astype(np.float32)
-        blocked = surface.scene.test_occlusions(import_open3d().core.Tensor(rays), 0.0, 0.97).numpy()
+        blocked = surface.scene.test_occlusions(
+            import_open3d().core.Tensor(rays), 0.0, 0.97
+        ).numpy()
         fade = strength * cosine[near] / (1.0 + 0.35 * distance[near] ** 2)
         direct[near] += np.where(blocked, 0.0, fade)
     hit = _around(surface, points, normal)
@@ -475,7 +578,9 @@ def _around(surface: Surface, points: FloatArray, normals: FloatArray) -> IntArr
     other = np.cross(normals, side)
     found = np.empty((_RAYS, len(points)), dtype=np.int64)
     for k, (angle, r) in enumerate(zip(turn, radius)):
-        direction = r * np.cos(angle) * side + r * np.sin(angle) * other + np.sqrt(1.0 - r * r) * normals
+        direction = (
+            r * np.cos(angle) * side + r * np.sin(angle) * other + np.sqrt(1.0 - r * r) * normals
+        )
         answer = surface.cast(np.hstack([points, direction]).astype(np.float32))
         met = np.isfinite(answer["t_hit"])
         found[k] = np.where(met, answer["primitive_ids"].astype(np.int64), -1)

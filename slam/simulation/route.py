@@ -28,7 +28,9 @@ ACCELERATION = 0.022  # along the road, metres per frame squared
 FEWEST_LOOP_FRAMES = 250
 MARGIN = 42.0  # depth of the outermost lots, metres
 SMALLEST_BLOCK = 22.0  # between two street centres, metres
-_ROADS: dict[StreetKind, tuple[float, float, float, tuple[float, float]]] = {  # blocks, side streets, half width
+_ROADS: dict[
+    StreetKind, tuple[float, float, float, tuple[float, float]]
+] = {  # blocks, side streets, half width
     "town": (38.0, 85.0, 0.45, (4.6, 5.2)),
     "avenue": (50.0, 110.0, 0.3, (4.6, 7.0)),
     "country": (90.0, 180.0, 0.3, (2.9, 4.2)),
@@ -75,7 +77,9 @@ def loop_cycle(rng: np.random.Generator, edges: int) -> list[Node]:
         if cycle is None:
             continue
         steps = np.diff([*cycle, *cycle[:2]], axis=0)
-        turns = np.sign(steps[:-1, 0] * steps[1:, 1] - steps[:-1, 1] * steps[1:, 0])  # 1 left, -1 right, 0 straight on
+        turns = np.sign(
+            steps[:-1, 0] * steps[1:, 1] - steps[:-1, 1] * steps[1:, 0]
+        )  # 1 left, -1 right, 0 straight on
         if len(np.unique(turns)) < 3:
             continue
         low = np.min(cycle, axis=0)
@@ -94,7 +98,9 @@ def grid_walk(rng: np.random.Generator, side: int, edges: int, spare: int) -> li
         while len(walk) <= edges + spare:
             x, y = walk[-1]
             steps = [(x + 1, y), (x - 1, y), (x, y + 1), (x, y - 1)]
-            steps = [s for s in steps if 0 <= s[0] < side and 0 <= s[1] < side and s not in walk[-2:-1]]
+            steps = [
+                s for s in steps if 0 <= s[0] < side and 0 <= s[1] < side and s not in walk[-2:-1]
+            ]
             walk.append(steps[rng.integers(len(steps))])
         driven: set[tuple[Node, Node]] = set()
         same = opposite = 0
@@ -102,13 +108,21 @@ def grid_walk(rng: np.random.Generator, side: int, edges: int, spare: int) -> li
             same += step in driven
             opposite += step[::-1] in driven
             driven.add(step)
-        score = min(same, 4) + 2.0 * min(opposite, 4) + 0.3 * len({tuple(sorted(step)) for step in driven})
+        score = (
+            min(same, 4)
+            + 2.0 * min(opposite, 4)
+            + 0.3 * len({tuple(sorted(step)) for step in driven})
+        )
         best = max(best, (score, walk), key=lambda pair: pair[0])
     return best[1]
 
 
 def town_plan(
-    rng: np.random.Generator, drive: list[Node], spacing: float, side_streets: float, kind: StreetKind = "town"
+    rng: np.random.Generator,
+    drive: list[Node],
+    spacing: float,
+    side_streets: float,
+    kind: StreetKind = "town",
 ) -> StreetPlan:
     """Lay streets under a drive over nodes, smallest coordinates zero, and some more beside it.
 
@@ -185,12 +199,16 @@ class Route:
     bend: Bend  # from plan to street coordinates
     T_street_camera: FloatArray  # (N, 4, 4); street: x east, y north, z up, metres
     camera_height_m: float  # of the camera at rest above the road
-    lane_street: FloatArray  # the driven path on the road, at least STEP metres of plan each, (M, 3)
+    lane_street: (
+        FloatArray  # the driven path on the road, at least STEP metres of plan each, (M, 3)
+    )
     lane_offset_m: float  # from the middle of the street to the right
     sample: FloatArray  # where in lane_street each frame is, (N,)
 
 
-def plan_route(route: str, frames: int, seed: int, still_frames: int = 0, variety: Variety | None = None) -> Route:
+def plan_route(
+    route: str, frames: int, seed: int, still_frames: int = 0, variety: Variety | None = None
+) -> Route:
     """Lay out streets and a drive of so many frames over them; ``still_frames`` stand in the middle.
 
     A ``loop`` drives its start again, a ``grid`` repeats streets in both directions (with about 250 frames), and
@@ -203,7 +221,9 @@ def plan_route(route: str, frames: int, seed: int, still_frames: int = 0, variet
     if moving < 2:
         raise SequenceError(f"this drive needs at least {still_frames + 2} frames; got {frames}")
     if route == "loop" and frames < FEWEST_LOOP_FRAMES:
-        raise SequenceError(f"a loop closes within {FEWEST_LOOP_FRAMES} frames or more; got {frames} frames")
+        raise SequenceError(
+            f"a loop closes within {FEWEST_LOOP_FRAMES} frames or more; got {frames} frames"
+        )
     stops = still_frames > 0
     plan, bend, lane_plan = _layout(route, moving, seed, stops, variety)
     arrival = _arrival(bend, lane_plan, stops, moving)
@@ -218,7 +238,9 @@ def plan_route(route: str, frames: int, seed: int, still_frames: int = 0, variet
         order = np.insert(np.arange(moving), rest, [rest] * still_frames)
         sample, T_street_camera = sample[order], T_street_camera[order]
     lane_street = bend(np.pad(lane_plan, ((0, 0), (0, 1))))
-    return Route(plan, bend, T_street_camera, camera_height_m, lane_street, _lane_offset(plan, seed), sample)
+    return Route(
+        plan, bend, T_street_camera, camera_height_m, lane_street, _lane_offset(plan, seed), sample
+    )
 
 
 def _layout(
@@ -231,13 +253,19 @@ def _layout(
     if route == "straight":
         end = START + 1.25 * moving + 5.0
         plan = road_plan(rng, end, kind)
-        bend = road_bend(np.random.default_rng([seed, 1]), plan.xs[0] - 200.0, plan.xs[-1] + 200.0, hills)
+        bend = road_bend(
+            np.random.default_rng([seed, 1]), plan.xs[0] - 200.0, plan.xs[-1] + 200.0, hills
+        )
         return plan, bend, _lane(plan, seed)[int(START / STEP) : int(end / STEP)]
     bend = town_bend(np.random.default_rng([seed, 1]), hills)
     if route == "grid":
         side = 3 if moving < 500 else 4 if moving < 1200 else 5
-        spacing = 24.0 if moving < 330 else 30.0 if moving < 500 else 40.0 if moving < 1200 else 52.0
-        walk = grid_walk(rng, side, int(0.95 * moving / spacing), spare=int(0.35 * moving / spacing) + 2)
+        spacing = (
+            24.0 if moving < 330 else 30.0 if moving < 500 else 40.0 if moving < 1200 else 52.0
+        )
+        walk = grid_walk(
+            rng, side, int(0.95 * moving / spacing), spare=int(0.35 * moving / spacing) + 2
+        )
         plan = town_plan(rng, walk, spacing, side_streets=0.6, kind=kind)
         return plan, bend, _lane(plan, seed)[int(5.0 / STEP) :]
     edges = max(8, 2 * round((0.95 * moving - OVERLAP) / 84.0))
@@ -279,7 +307,11 @@ def _lane(plan: StreetPlan, seed: int) -> FloatArray:
     for node, before, after, turn in zip(nodes[1:-1], right[:-1], right[1:], turns):
         corners.append(node + offset * (before + after if abs(turn) > 0.5 else after))
     corners.append(nodes[-1] + offset * right[-1])
-    rounded = [point for three in zip(corners[:-2], corners[1:-1], corners[2:]) for point in _corner(rng, *three)]
+    rounded = [
+        point
+        for three in zip(corners[:-2], corners[1:-1], corners[2:])
+        for point in _corner(rng, *three)
+    ]
     path = _resample(np.stack([corners[0], *rounded, corners[-1]]))
     path = gaussian_filter1d(path, 1.6 / STEP, axis=0, mode="nearest")
     tangent = np.gradient(path, axis=0)
@@ -290,7 +322,9 @@ def _lane(plan: StreetPlan, seed: int) -> FloatArray:
     return _resample(path)
 
 
-def _corner(rng: np.random.Generator, before: FloatArray, corner: FloatArray, after: FloatArray) -> list[FloatArray]:
+def _corner(
+    rng: np.random.Generator, before: FloatArray, corner: FloatArray, after: FloatArray
+) -> list[FloatArray]:
     """An arc of 8.5 to 11 m radius, less where the edges are short; nothing but the corner if straight on."""
     a, b = before - corner, after - corner
     shorter = min(float(np.linalg.norm(a)), float(np.linalg.norm(b)))
@@ -300,7 +334,9 @@ def _corner(rng: np.random.Generator, before: FloatArray, corner: FloatArray, af
         return [corner]
     radius = min(wish, 0.49 * shorter)
     centre = corner + radius * (a + b)
-    return [centre - radius * (np.cos(t) * b + np.sin(t) * a) for t in np.linspace(0.0, np.pi / 2.0, 12)]
+    return [
+        centre - radius * (np.cos(t) * b + np.sin(t) * a) for t in np.linspace(0.0, np.pi / 2.0, 12)
+    ]
 
 
 def _resample(path: FloatArray) -> FloatArray:
@@ -319,7 +355,9 @@ def _arrival(bend: Bend, lane_plan: FloatArray, stops: bool, moving: int) -> Flo
     curvature = np.abs(gaussian_filter1d(np.gradient(heading), 4.0)) / float(step.mean())
     along = np.cumsum(step)
     cruise = CRUISE * (1.0 + 0.12 * np.sin(along / 23.0) * np.sin(along / 61.0 + 1.0))
-    speed = np.clip(np.sqrt(LATERAL_ACCELERATION / np.maximum(curvature[1:], 1e-4)), SLOWEST, cruise)
+    speed = np.clip(
+        np.sqrt(LATERAL_ACCELERATION / np.maximum(curvature[1:], 1e-4)), SLOWEST, cruise
+    )
     if stops:
         rest = 0.5 * min(float(along[-1]), 0.9 * moving)
         speed = np.minimum(speed, 0.08 + np.sqrt(2.5 * ACCELERATION * np.abs(along - rest)))
@@ -358,7 +396,9 @@ def _poses(
     down = np.cross(forward, right)
     # suspension: pitch, yaw and roll about x, y, z in radians and height in metres, correlated in time, (N, 4)
     white = rng.standard_normal((len(at) + 60, 4))
-    slow, fast = (gaussian_filter1d(white, sigma, axis=0) * np.sqrt(3.54 * sigma) for sigma in (8.0, 2.0))
+    slow, fast = (
+        gaussian_filter1d(white, sigma, axis=0) * np.sqrt(3.54 * sigma) for sigma in (8.0, 2.0)
+    )
     mixed = (0.8 * slow + 0.6 * fast)[30:-30]
     sizes = np.array([np.deg2rad(0.3), np.deg2rad(0.2), np.deg2rad(0.3), 0.012])
     suspension = np.clip(mixed, -2.2, 2.2) * sizes

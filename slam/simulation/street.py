@@ -20,7 +20,15 @@ from slam.simulation.options import SimulationOptions, draw_variety
 from slam.simulation.route import STEP, Route, plan_route
 from slam.simulation.texture import Texels, fractal
 from slam.simulation.town import build_town
-from slam.simulation.world import SHUTTER, Hits, SimulatedWorld, Surface, place_rays, square_camera, through_lens
+from slam.simulation.world import (
+    SHUTTER,
+    Hits,
+    SimulatedWorld,
+    Surface,
+    place_rays,
+    square_camera,
+    through_lens,
+)
 
 # KITTI odometry 00-02 (rectified colour camera), at the size it was recorded at
 KITTI_CAMERA = Intrinsics(1241, 376, 718.856, 718.856, 607.1928, 185.2157)
@@ -50,7 +58,9 @@ class SimulatedStreet(SimulatedWorld):
         """Plan the drive; ``SequenceError`` where there are too few frames for the route."""
         size = options.width, options.height
         still = STILL_FRAMES if "stop" in options.hazards else 0
-        variety = draw_variety(options.seed, options.route == "straight") if options.varied else None
+        variety = (
+            draw_variety(options.seed, options.route == "straight") if options.varied else None
+        )
         camera = KITTI_CAMERA.resized(*size) if variety is None else variety.camera(*size)
         if options.fov_deg is not None:
             camera = square_camera(*size, options.fov_deg)
@@ -59,15 +69,23 @@ class SimulatedStreet(SimulatedWorld):
         self.camera_height_m = self._route.camera_height_m
         self.T_camera_lidar = T_CAMERA_LIDAR.copy()
         self._variety = variety
-        self._weather = draw_varied_weather(options.seed) if options.varied else draw_weather(options.seed)
+        self._weather = (
+            draw_varied_weather(options.seed) if options.varied else draw_weather(options.seed)
+        )
         rng = np.random.default_rng([options.seed, 31])
-        self._exposure = np.empty((options.frames, 2))  # gain and gamma of every frame, piecewise constant
+        self._exposure = np.empty(
+            (options.frames, 2)
+        )  # gain and gamma of every frame, piecewise constant
         start = 0
         while start < options.frames:
             stop = start + int(rng.integers(12, 45))
             self._exposure[start:stop] = rng.uniform(0.55, 1.5), rng.uniform(0.75, 1.3)
             start = stop
-        self._traffic = Traffic(self._route, options.seed, options.varied) if "moving-cars" in options.hazards else None
+        self._traffic = (
+            Traffic(self._route, options.seed, options.varied)
+            if "moving-cars" in options.hazards
+            else None
+        )
 
     def scan(self, index: int) -> Float32Array:
         """LiDAR points of one frame: x, y, z in the LiDAR frame, metres, and reflectance, ``(M, 4)``."""
@@ -92,14 +110,20 @@ class SimulatedStreet(SimulatedWorld):
             reflectance[nearer] = surface.mesh.colours[0][:, instance].mean(axis=0)
         returned = (ranges > NEAREST_M) & (ranges < FARTHEST_M)
         noisy = ranges[returned] + rng.normal(0.0, RANGE_NOISE_M, int(returned.sum()))
-        return np.column_stack([directions[returned] * noisy[:, None], reflectance[returned]]).astype(np.float32)
+        return np.column_stack(
+            [directions[returned] * noisy[:, None], reflectance[returned]]
+        ).astype(np.float32)
 
     def _build(self) -> Mesh:
-        return build_town(self._route.plan, self._route.bend, self.options.seed, self.options.varied)
+        return build_town(
+            self._route.plan, self._route.bend, self.options.seed, self.options.varied
+        )
 
     def _moving(self, index: int) -> list[Mesh]:
         cars = self._traffic.placed(index) if self._traffic else []
-        return cars + (self._bonnet.placed({0: self._route.T_street_camera[index]}) if self._bonnet else [])
+        return cars + (
+            self._bonnet.placed({0: self._route.T_street_camera[index]}) if self._bonnet else []
+        )
 
     @functools.cached_property
     def _bonnet(self) -> Moving | None:
@@ -107,7 +131,9 @@ class SimulatedStreet(SimulatedWorld):
         if self._variety is None or self._variety.bonnet == 0.0 or "blur" in self.options.hazards:
             return None
         rng = np.random.default_rng([self.options.seed, 12])
-        below = (self.options.height * (1.0 - self._variety.bonnet) - self.camera.cy) / self.camera.fy
+        below = (
+            self.options.height * (1.0 - self._variety.bonnet) - self.camera.cy
+        ) / self.camera.fy
         return Moving(rng, [lambda soup: bonnet(soup, rng, below, self.camera_height_m)])
 
     @functools.cached_property
@@ -116,7 +142,10 @@ class SimulatedStreet(SimulatedWorld):
         if self._weather.exposure is not None:
             return self._weather.exposure
         frames = (0, len(self) // 2, len(self) - 1)
-        views = [self._view(self._surfaces(index), self._route.T_street_camera[index])[0] for index in frames]
+        views = [
+            self._view(self._surfaces(index), self._route.T_street_camera[index])[0]
+            for index in frames
+        ]
         brightest = float(np.quantile(np.max(views, axis=-1), 1.0 - self._weather.saturated))
         return max(1.0 / brightest, _DARKEST_MEAN / float(np.mean(np.minimum(views, brightest))))
 
@@ -143,24 +172,39 @@ class SimulatedStreet(SimulatedWorld):
         still = np.zeros_like(up)
         size = 0.006 / (up + 0.12)
         texels = Texels(plane[0], plane[1], size, size, still, still)
-        cover = fractal(texels, (1.6, 1.6, 0.6), (0.6, 0.6, 0.35), (0.22, 0.22, 0.18)) + weather.clouds - 0.5
+        cover = (
+            fractal(texels, (1.6, 1.6, 0.6), (0.6, 0.6, 0.35), (0.22, 0.22, 0.18))
+            + weather.clouds
+            - 0.5
+        )
         fraction = np.clip(1.6 * cover, 0.0, 0.85)
         white = 0.88 + 0.08 * np.clip(cover, 0.0, 1.0)
         return np.asarray(rgb + fraction * (white - rgb), dtype=np.float32)
 
     def _shade(
-        self, surfaces: list[Surface], number: int, hits: Hits, rays: Float32Array, pixels: NDArray[np.int64]
+        self,
+        surfaces: list[Surface],
+        number: int,
+        hits: Hits,
+        rays: Float32Array,
+        pixels: NDArray[np.int64],
     ) -> Float32Array:
         weather, mesh = self._weather, surfaces[number].mesh
         towards = np.flatnonzero(weather.sun @ hits.normals > 0.0)
         to_sun = np.take(rays, towards, axis=0)
-        to_sun[:, :3] += to_sun[:, 3:] * hits.depth[towards, None] + 0.03 * hits.normals[:, towards].T
+        to_sun[:, :3] += (
+            to_sun[:, 3:] * hits.depth[towards, None] + 0.03 * hits.normals[:, towards].T
+        )
         to_sun[:, 3:] = weather.sun
         tensor = import_open3d().core.Tensor(to_sun)
-        shadow = np.any([surface.scene.test_occlusions(tensor).numpy() for surface in surfaces], axis=0)
+        shadow = np.any(
+            [surface.scene.test_occlusions(tensor).numpy() for surface in surfaces], axis=0
+        )
         lit = np.ones(self.options.height * self.options.width, dtype=np.float32)
         lit[pixels[towards]] = 1.0 - shadow
-        soft = cv2.blur(lit.reshape(self.options.height, self.options.width), (3, 3))  # over neighbouring pixels
+        soft = cv2.blur(
+            lit.reshape(self.options.height, self.options.width), (3, 3)
+        )  # over neighbouring pixels
         lit = np.asarray(np.take(soft, pixels), dtype=np.float32)
         rgb = surfaces[number].unlit(hits, self.camera.fx)
         if weather.contrast != 1.0:
@@ -179,14 +223,18 @@ class SimulatedStreet(SimulatedWorld):
         rgb = rgb * np.float32(self._gain)
         if "rain" in self.options.hazards:
             rgb = rained_on(rgb, self.options.seed, index)
-        rgb = through_lens(rgb) if self._variety is None else through_lens(rgb, self._variety.blur_px)
+        rgb = (
+            through_lens(rgb) if self._variety is None else through_lens(rgb, self._variety.blur_px)
+        )
         if "exposure" in self.options.hazards:
             gain, gamma = self._exposure[index].tolist()
             rgb = np.asarray(gain * np.power(np.clip(rgb, 0.0, 1.0), gamma), dtype=np.float32)
         if self._variety is not None:
             y, x = (np.linspace(-1.0, 1.0, side, dtype=np.float32) for side in rgb.shape[:2])
             falloff = 1.0 - np.float32(0.5 * self._variety.vignette) * (x * x + (y * y)[:, None])
-            grain = np.random.default_rng([self.options.seed, 35, index]).standard_normal(rgb.shape, dtype=np.float32)
+            grain = np.random.default_rng([self.options.seed, 35, index]).standard_normal(
+                rgb.shape, dtype=np.float32
+            )
             rgb = np.asarray(rgb * falloff[..., None] + np.float32(self._variety.noise) * grain)
         return rgb
 
@@ -217,7 +265,9 @@ class Weather:
     horizon: Float32Array  # colour of the sky low down, and of the haze, (3,)
     clouds: float  # cover, 0 to 1
     visibility_m: float  # distance at which the haze has taken 63 %
-    exposure: float | None  # gain of the camera; None sets it so that a share of the pixels saturates
+    exposure: (
+        float | None
+    )  # gain of the camera; None sets it so that a share of the pixels saturates
     saturated: float = 0.0  # that share
     contrast: float = 1.0  # of textures, an exponent; 1 as they are painted
 
@@ -225,7 +275,11 @@ class Weather:
 def _draw_sun(rng: np.random.Generator, lowest: float, highest: float) -> FloatArray:
     """Its direction at an elevation in radians, ``(3,)``."""
     azimuth, elevation = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(lowest, highest)
-    sun = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    sun = [
+        np.cos(elevation) * np.cos(azimuth),
+        np.cos(elevation) * np.sin(azimuth),
+        np.sin(elevation),
+    ]
     return np.array(sun)
 
 
@@ -251,7 +305,11 @@ def draw_varied_weather(seed: int) -> Weather:
     rng = np.random.default_rng([seed, 21])
     sun = _draw_sun(rng, 0.3, 1.15)
     sunny = rng.random() < 0.75
-    ambient = 1.0 / float(np.exp(rng.uniform(np.log(3.0), np.log(10.0)))) if sunny else float(rng.uniform(0.6, 0.95))
+    ambient = (
+        1.0 / float(np.exp(rng.uniform(np.log(3.0), np.log(10.0))))
+        if sunny
+        else float(rng.uniform(0.6, 0.95))
+    )
     bright = float(rng.uniform(0.6, 1.3) if sunny else rng.uniform(0.9, 1.4))
     blue = np.array([0.30, 0.52, 0.85]) + rng.uniform(-0.08, 0.08, 3)
     return Weather(
@@ -259,7 +317,9 @@ def draw_varied_weather(seed: int) -> Weather:
         sunshine=(1.0 - ambient) / sun[2],  # a level road has 1 in the sun
         ambient=ambient,
         zenith=(bright * blue).astype(np.float32),
-        horizon=(bright * (np.array([0.80, 0.86, 0.92]) + rng.uniform(-0.08, 0.08, 3))).astype(np.float32),
+        horizon=(bright * (np.array([0.80, 0.86, 0.92]) + rng.uniform(-0.08, 0.08, 3))).astype(
+            np.float32
+        ),
         clouds=float(rng.uniform(0.0, 0.8) if sunny else rng.uniform(0.6, 1.0)),
         visibility_m=float(rng.uniform(300.0, 1500.0)),
         exposure=None,
@@ -280,7 +340,9 @@ class Traffic:
         while meets < len(drive.sample):
             speed = -float(rng.uniform(0.7, 1.2)) / STEP
             start = float(drive.sample[int(meets)]) - speed * meets
-            self._courses.append((start, speed, 2.0 * drive.lane_offset_m + float(rng.uniform(0.0, 0.3)), -1.0))
+            self._courses.append(
+                (start, speed, 2.0 * drive.lane_offset_m + float(rng.uniform(0.0, 0.3)), -1.0)
+            )
             meets += float(rng.uniform(12.0, 40.0))
         if overtaking:
             self._plan_passing(np.random.default_rng([seed, 34]))
@@ -297,7 +359,9 @@ class Traffic:
             speed = float(rng.uniform(1.15, 1.9) if left else rng.uniform(0.2, 0.8)) / STEP
             lanes = float(rng.uniform(1.5, 2.1) if left else rng.uniform(-1.1, -0.9))
             left_m = min(self._route.lane_offset_m, WIDEST_LANE_M) * lanes
-            self._courses.append((float(self._route.sample[beside]) - speed * beside, speed, left_m, 1.0))
+            self._courses.append(
+                (float(self._route.sample[beside]) - speed * beside, speed, left_m, 1.0)
+            )
 
     def placed(self, index: int) -> list[Mesh]:
         """The cars within sight at a frame, in the street frame."""
@@ -305,11 +369,23 @@ class Traffic:
         # the one in the camera's lane keeps its distance, until it drives away
         faster = max(0.0, index - self._leader_leaves) * 0.5 / STEP
         T_street_cars = [self._at(float(self._route.sample[index]) + self._gap + faster, 0.0, 1.0)]
-        T_street_cars += [self._at(start + speed * index, left_m, way) for start, speed, left_m, way in self._courses]
-        there = {number: T_street_car for number, T_street_car in enumerate(T_street_cars) if T_street_car is not None}
-        away = {number: np.linalg.norm(T_street_car[:3, 3] - camera) for number, T_street_car in there.items()}
+        T_street_cars += [
+            self._at(start + speed * index, left_m, way)
+            for start, speed, left_m, way in self._courses
+        ]
+        there = {
+            number: T_street_car
+            for number, T_street_car in enumerate(T_street_cars)
+            if T_street_car is not None
+        }
+        away = {
+            number: np.linalg.norm(T_street_car[:3, 3] - camera)
+            for number, T_street_car in there.items()
+        }
         # nearer only where the drive crosses itself
-        return self._cars.placed({number: there[number] for number in there if 2.6 < away[number] < 120.0})
+        return self._cars.placed(
+            {number: there[number] for number in there if 2.6 < away[number] < 120.0}
+        )
 
     def _at(self, sample: float, left_m: float, sense: float) -> FloatArray | None:
         """``T_street_car`` at a lane sample, beside the lane; None beyond its ends."""

@@ -76,7 +76,9 @@ def fractal(texels: Texels, *octaves: tuple[float, float, float]) -> Float32Arra
     return total
 
 
-def stripes(x: Lengths, size: Lengths, period: Lengths | float, width: Lengths | float) -> Float32Array:
+def stripes(
+    x: Lengths, size: Lengths, period: Lengths | float, width: Lengths | float
+) -> Float32Array:
     """Fraction of each pixel covered by stripes [k period, k period + width], filtered over ``size``."""
     half = 0.5 * np.maximum(size, 1e-4)
 
@@ -90,10 +92,14 @@ def stripes(x: Lengths, size: Lengths, period: Lengths | float, width: Lengths |
 def band(x: Lengths, size: Lengths, low: Lengths | float, high: Lengths | float) -> Float32Array:
     """Fraction of each pixel covered by the one stripe [low, high]."""
     inverse = 1.0 / np.maximum(size, 1e-4)
-    return np.asarray(np.clip((x - low) * inverse + 0.5, 0, 1) - np.clip((x - high) * inverse + 0.5, 0, 1))
+    return np.asarray(
+        np.clip((x - low) * inverse + 0.5, 0, 1) - np.clip((x - high) * inverse + 0.5, 0, 1)
+    )
 
 
-def mix(a: Lengths | np.floating[Any], b: Lengths | np.floating[Any], fraction: Lengths) -> Float32Array:
+def mix(
+    a: Lengths | np.floating[Any], b: Lengths | np.floating[Any], fraction: Lengths
+) -> Float32Array:
     """Blend colours ``(3, N)`` by a weight ``(N,)``."""
     return np.asarray(a + fraction * (b - a), dtype=np.float32)
 
@@ -127,20 +133,32 @@ def _text(texels: Texels, line: Lengths | float, letter: float) -> Float32Array:
 
 def _plaster(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
     skirting, period, contrast = parameters[:3]
-    grain = fractal(texels, (2.3, 1.9, 0.02), (0.4, 0.4, 0.012), (0.05, 0.05, 0.02), (0.015, 0.015, 0.02))
-    figure = stripes(texels.u, texels.u_size, np.maximum(period, 0.05), 0.4 * np.maximum(period, 0.05)) * (period > 0)
+    grain = fractal(
+        texels, (2.3, 1.9, 0.02), (0.4, 0.4, 0.012), (0.05, 0.05, 0.02), (0.015, 0.015, 0.02)
+    )
+    figure = stripes(
+        texels.u, texels.u_size, np.maximum(period, 0.05), 0.4 * np.maximum(period, 0.05)
+    ) * (period > 0)
     rgb = colours[0] * (1.0 + grain - contrast * figure)
-    return mix(rgb, colours[1] * (1.0 + grain), band(texels.v, texels.v_size, -1.0, skirting) * (skirting > 0))
+    return mix(
+        rgb,
+        colours[1] * (1.0 + grain),
+        band(texels.v, texels.v_size, -1.0, skirting) * (skirting > 0),
+    )
 
 
 def _tiles(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
     side, joint = parameters[0], parameters[1]
-    joints = np.maximum(stripes(texels.u, texels.u_size, side, joint), stripes(texels.v, texels.v_size, side, joint))
+    joints = np.maximum(
+        stripes(texels.u, texels.u_size, side, joint), stripes(texels.v, texels.v_size, side, joint)
+    )
     near = np.clip(side / _size(texels) / 2.0 - 0.5, 0.0, 1.0)
     tone = 0.07 * near * (cell_hash(texels.u / side, texels.v / side, 1) - 0.5)
     grain = fractal(texels, (0.5, 0.4, 0.03), (0.06, 0.05, 0.03))
     chequered = (np.floor(texels.u / side) + np.floor(texels.v / side)) % 2 * parameters[2] * near
-    return mix(mix(colours[0] * (1.0 + grain + tone), 0.5 * colours[1], chequered), colours[1], joints)
+    return mix(
+        mix(colours[0] * (1.0 + grain + tone), 0.5 * colours[1], chequered), colours[1], joints
+    )
 
 
 def _boards(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
@@ -150,7 +168,9 @@ def _boards(texels: Texels, colours: Float32Array, parameters: Float32Array) -> 
     near = np.clip(width / texels.v_size - 1.0, 0.0, 1.0)
     tone = 0.3 * near * (cell_hash(np.divide(along, 0.9, dtype=np.float32), row, 4) - 0.5)
     veins = fractal(texels, (0.9, 0.06, 0.1), (0.25, 0.02, 0.12), (0.08, 0.008, 0.1))
-    gaps = np.maximum(stripes(texels.v, texels.v_size, width, 0.006), stripes(along, texels.u_size, 0.9, 0.006))
+    gaps = np.maximum(
+        stripes(texels.v, texels.v_size, width, 0.006), stripes(along, texels.u_size, 0.9, 0.006)
+    )
     return np.asarray(colours[0] * (1.0 + tone + veins) * (1.0 - 0.55 * gaps))
 
 
@@ -159,7 +179,9 @@ def _carpet(texels: Texels, colours: Float32Array, parameters: Float32Array) -> 
     u, v = texels.u - 0.5 * width, texels.v - 0.5 * height
     lozenge = np.abs((u / motif) % 1.0 - 0.5) + np.abs((v / motif) % 1.0 - 0.5)
     soft = _size(texels) / motif
-    figure = np.clip((0.3 - lozenge) / np.maximum(soft, 0.02) + 0.5, 0.0, 1.0) * np.clip(0.7 / soft - 1.0, 0.0, 1.0)
+    figure = np.clip((0.3 - lozenge) / np.maximum(soft, 0.02) + 0.5, 0.0, 1.0) * np.clip(
+        0.7 / soft - 1.0, 0.0, 1.0
+    )
     border = _rim(texels, width, height, 0.18) - _rim(texels, width, height, 0.08)
     grain = 1.0 + fractal(texels, (0.3, 0.3, 0.08), (0.03, 0.03, 0.12), (0.01, 0.01, 0.15))
     return mix(colours[0], colours[1], np.maximum(figure, border)) * grain
@@ -168,7 +190,10 @@ def _carpet(texels: Texels, colours: Float32Array, parameters: Float32Array) -> 
 def _wood(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
     width, height = np.where(parameters[:2] > 0.0, parameters[:2], 9.0)  # of a door
     veins = fractal(texels, (0.03, 0.5, 0.09), (0.01, 0.25, 0.08), (0.3, 1.1, 0.1))
-    gaps = np.maximum(stripes(texels.u, texels.u_size, width, 0.008), stripes(texels.v, texels.v_size, height, 0.008))
+    gaps = np.maximum(
+        stripes(texels.u, texels.u_size, width, 0.008),
+        stripes(texels.v, texels.v_size, height, 0.008),
+    )
     knob = np.hypot(texels.u % width - 0.87 * width, texels.v % height - 0.5 * height)
     knobs = np.clip((0.022 - knob) / _size(texels) + 0.5, 0.0, 1.0) * (width < 9.0)
     return mix(colours[0] * (1.0 + veins) * (1.0 - 0.6 * gaps), colours[1], knobs)
@@ -185,11 +210,15 @@ def _books(texels: Texels, colours: Float32Array, parameters: Float32Array) -> F
     filled = cell_hash((spine / 7.0 + texels.shift).astype(np.float32), shelf, 14) > 0.15
     tall = row * (0.55 + 0.33 * luck[0]) * filled
     near = np.clip(0.045 / texels.u_size - 0.4, 0.0, 1.0)
-    spines = 0.1 + 0.55 * (0.5 * np.stack(luck) + 0.5 * luck[0]).astype(np.float32) * (0.5 + 0.5 * luck[1])
+    spines = 0.1 + 0.55 * (0.5 * np.stack(luck) + 0.5 * luck[0]).astype(np.float32) * (
+        0.5 + 0.5 * luck[1]
+    )
     title = band(v, texels.v_size, 0.6 * tall, 0.75 * tall) * (luck[2] > 0.5)
     rgb = mix(np.float32(0.42), mix(spines, 1.0 - 0.6 * spines, 0.8 * title), near)
     rgb = mix(0.25 * colours[0], rgb, band(v, texels.v_size, 0.0, tall))
-    boards = np.maximum(stripes(texels.v + 0.012, texels.v_size, row, 0.024), _rim(texels, width, height, 0.025))
+    boards = np.maximum(
+        stripes(texels.v + 0.012, texels.v_size, row, 0.024), _rim(texels, width, height, 0.025)
+    )
     return mix(rgb, colours[0] * (1.0 + fractal(texels, (0.4, 0.05, 0.1))), boards)
 
 
@@ -197,7 +226,10 @@ def _picture(texels: Texels, colours: Float32Array, parameters: Float32Array) ->
     """A painting of blots, or a poster of a picture and text, in a frame."""
     width, height, kind = parameters[:3]
     blot = fractal(texels, (0.31, 0.27, 1.0), (0.12, 0.11, 0.7), (0.05, 0.05, 0.4))
-    first, second = np.clip(9.0 * blot + 0.5, 0.0, 1.0), np.clip(9.0 * np.abs(blot - 0.3) - 1.2, 0.0, 1.0)
+    first, second = (
+        np.clip(9.0 * blot + 0.5, 0.0, 1.0),
+        np.clip(9.0 * np.abs(blot - 0.3) - 1.2, 0.0, 1.0),
+    )
     third = np.stack([colours[1][2], colours[0][0], colours[1][0]])
     rgb = mix(mix(third, colours[0], second), colours[1], first)
     line = 0.03 + 0.02 * (kind - 1.0)
@@ -219,7 +251,10 @@ def _pane(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Fl
     """A bright window or a mirror, with a frame and a cross of bars."""
     width, height, bars = parameters[:3]
     bar = band(texels.u, texels.u_size, 0.5 * width - 0.02, 0.5 * width + 0.02)
-    bar = np.maximum(bar, band(texels.v, texels.v_size, 0.65 * height - 0.02, 0.65 * height + 0.02)) * bars
+    bar = (
+        np.maximum(bar, band(texels.v, texels.v_size, 0.65 * height - 0.02, 0.65 * height + 0.02))
+        * bars
+    )
     sheen = 1.0 + 0.1 * (texels.v / height - 0.5) + fractal(texels, (0.9, 0.7, 0.05))
     return mix(colours[0] * sheen, colours[1], np.maximum(bar, _rim(texels, width, height, 0.045)))
 
@@ -230,7 +265,9 @@ def _carton(texels: Texels, colours: Float32Array, parameters: Float32Array) -> 
     tape = band(texels.v, texels.v_size, 0.47 * height, 0.47 * height + 0.05)
     rgb = mix(colours[0] * (1.0 + grain), 1.25 * colours[0], 0.7 * tape)
     label = band(texels.u, texels.u_size, 0.1 * width, 0.45 * width)
-    label = label * band(texels.v, texels.v_size, 0.08 * height, 0.38 * height) * (colours[1][0] > 0.3)
+    label = (
+        label * band(texels.v, texels.v_size, 0.08 * height, 0.38 * height) * (colours[1][0] > 0.3)
+    )
     rgb = mix(rgb, mix(np.float32(0.88), colours[1] * 0.3, _text(texels, 0.035, 0.03)), label)
     return rgb * (1.0 - 0.35 * _rim(texels, width, height, 0.008))
 
@@ -246,29 +283,46 @@ def _asphalt(texels: Texels, colours: Float32Array, parameters: Float32Array) ->
     else:
         paint = lengthways * band(texels.v, texels.v_size, -0.07, 0.07)
     if parameters[3, 0] > 0.5:
-        low, high = (2.15, 2.03) if half > 4.5 else (0.35, 0.23)  # beside parked cars, or beside the verge
+        low, high = (
+            (2.15, 2.03) if half > 4.5 else (0.35, 0.23)
+        )  # beside parked cars, or beside the verge
         paint += band(np.abs(texels.v), texels.v_size, half - low, half - high)
     painted = np.flatnonzero(paint > 0.01)
-    wear = np.clip(0.78 + fractal(_take(texels, painted), (0.9, 0.2, 0.5), (0.3, 0.1, 0.3)), 0.15, 1.0)
+    wear = np.clip(
+        0.78 + fractal(_take(texels, painted), (0.9, 0.2, 0.5), (0.3, 0.1, 0.3)), 0.15, 1.0
+    )
     rgb[:, painted] = mix(rgb[:, painted], colours[1][:, painted], paint[painted] * wear)
     return rgb
 
 
 def _junction(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    grain = fractal(texels, (7.0, 2.2, 0.17), (2.0, 0.5, 0.22), (1.1, 0.17, 0.2), (0.35, 0.24, 0.2), (0.11, 0.07, 0.16))
+    grain = fractal(
+        texels,
+        (7.0, 2.2, 0.17),
+        (2.0, 0.5, 0.22),
+        (1.1, 0.17, 0.2),
+        (0.35, 0.24, 0.2),
+        (0.11, 0.07, 0.16),
+    )
     repair = fractal(texels, (5.0, 2.4, 1.0))  # repaired patches have sharp edges
     patch = np.clip((repair - 0.42) * 6.0, 0.0, 1.0) * 0.26
-    crack = 0.3 * np.clip(1.0 - 14.0 * np.abs(fractal(texels, (2.6, 1.3, 1.0)) + 0.4 * grain - 0.05), 0.0, 1.0)
+    crack = 0.3 * np.clip(
+        1.0 - 14.0 * np.abs(fractal(texels, (2.6, 1.3, 1.0)) + 0.4 * grain - 0.05), 0.0, 1.0
+    )
     rough = 1.0 - parameters[5, 0]
     return np.asarray(colours[0] * (1.0 + rough * grain - rough * patch - rough * crack))
 
 
 def _pavement(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
     slab = float(parameters[0, 0])
-    joints = np.maximum(stripes(texels.u, texels.u_size, slab, 0.035), stripes(texels.v, texels.v_size, slab, 0.035))
+    joints = np.maximum(
+        stripes(texels.u, texels.u_size, slab, 0.035), stripes(texels.v, texels.v_size, slab, 0.035)
+    )
     near = np.clip(slab / _size(texels) / 2.0 - 0.5, 0.0, 1.0)
     tone = (cell_hash(texels.u / slab, texels.v / slab, 1) - 0.5) * near * 0.3
-    grain = fractal(texels, (4.0, 4.0, 0.2), (1.0, 1.0, 0.16), (0.25, 0.25, 0.2), (0.08, 0.08, 0.12))
+    grain = fractal(
+        texels, (4.0, 4.0, 0.2), (1.0, 1.0, 0.16), (0.25, 0.25, 0.2), (0.08, 0.08, 0.12)
+    )
     return mix(colours[0] * (1.0 + grain + tone), 0.6 * colours[1], joints)
 
 
@@ -280,7 +334,9 @@ def _kerb(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Fl
 
 def _mottled(*octaves: tuple[float, float, float]) -> Shader:
     """Two colours blended by noise."""
-    return lambda texels, colours, _: mix(colours[0], colours[1], np.clip(0.45 + fractal(texels, *octaves), -0.3, 1.2))
+    return lambda texels, colours, _: mix(
+        colours[0], colours[1], np.clip(0.45 + fractal(texels, *octaves), -0.3, 1.2)
+    )
 
 
 def _grained(*octaves: tuple[float, float, float]) -> Shader:
@@ -291,7 +347,9 @@ def _grained(*octaves: tuple[float, float, float]) -> Shader:
 def _wall(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
     _, spacing, window, _, style, height = parameters
     u, v = texels.u - 0.5 * (spacing - window), texels.v
-    grain = fractal(texels, (3.1, 3.7, 0.18), (1.1, 1.2, 0.14), (0.35, 0.4, 0.14), (0.12, 0.12, 0.12))
+    grain = fractal(
+        texels, (3.1, 3.7, 0.18), (1.1, 1.2, 0.14), (0.35, 0.4, 0.14), (0.12, 0.12, 0.12)
+    )
     row = np.where(style == 2.0, np.float32(0.24), np.float32(0.17))
     joints = stripes(v, texels.v_size, row, 0.18 * row) * (style > 0.0)
     brick = stripes(u + 0.22 * np.floor(v / row), texels.u_size, 0.44, 0.05) * (style == 1.0)
@@ -307,7 +365,9 @@ def _wall(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Fl
     return rgb
 
 
-def _windows(rgb: Float32Array, texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
+def _windows(
+    rgb: Float32Array, texels: Texels, colours: Float32Array, parameters: Float32Array
+) -> Float32Array:
     """Rows of framed windows, and doors on the ground floor, painted over a wall ``(3, N)``."""
     floor, spacing, window, tall = parameters[:4]
     u, v = texels.u - 0.5 * (spacing - window), texels.v
@@ -327,7 +387,9 @@ def _windows(rgb: Float32Array, texels: Texels, colours: Float32Array, parameter
     framed, pane = opening(0.11), opening(-0.03)
     # a cross of glazing bars, and panes that mirror a bright or a dark part of the street
     bars = band(x, texels.u_size, 0.5 * window - 0.035, 0.5 * window + 0.035)
-    bars = np.maximum(bars, band(y, texels.v_size, low + 0.62 * tall - 0.03, low + 0.62 * tall + 0.03) * ~door)
+    bars = np.maximum(
+        bars, band(y, texels.v_size, low + 0.62 * tall - 0.03, low + 0.62 * tall + 0.03) * ~door
+    )
     tone = cell_hash(column + salt, storey + texels.shift_v, 5)
     blotch = 0.1 * fractal(texels, (0.9, 0.7, 1.0))
     sheen = np.clip(0.12 + 0.55 * tone * tone + 0.25 * (y - low) / (high - low) + blotch, 0.03, 0.9)
@@ -352,15 +414,23 @@ def _sign(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Fl
     x, y, size = texels.u - half, texels.v - half, _size(texels)
     edge = np.where(kind == 0, np.hypot(x, y), np.maximum(np.abs(x), np.abs(y))) / half
     rim = np.clip((edge - 0.72) * half / size + 0.5, 0.0, 1.0)
-    bar = band(y, texels.v_size, -0.14 * half, 0.16 * half) * band(np.abs(x), texels.u_size, -1.0, 0.5 * half)
+    bar = band(y, texels.v_size, -0.14 * half, 0.16 * half) * band(
+        np.abs(x), texels.u_size, -1.0, 0.5 * half
+    )
     plain = mix(colours[1], colours[0], np.maximum(rim, bar))
     inverse = mix(colours[0], colours[1], np.maximum(rim, bar))
     return np.asarray(np.where((kind == 2), inverse, plain))
 
 
 def _paint(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    seams = np.maximum(stripes(texels.u - 0.2, texels.u_size, 1.05, 0.05), band(texels.v, texels.v_size, -0.1, 0.1))
-    light = 1.0 + 0.25 * np.clip(texels.v - 0.3, -0.4, 0.5) + fractal(texels, (1.3, 0.3, 0.16), (0.3, 0.2, 0.1))
+    seams = np.maximum(
+        stripes(texels.u - 0.2, texels.u_size, 1.05, 0.05), band(texels.v, texels.v_size, -0.1, 0.1)
+    )
+    light = (
+        1.0
+        + 0.25 * np.clip(texels.v - 0.3, -0.4, 0.5)
+        + fractal(texels, (1.3, 0.3, 0.16), (0.3, 0.2, 0.1))
+    )
     return mix(colours[0] * light, colours[1], 0.7 * seams)
 
 
@@ -372,7 +442,9 @@ def _glass(texels: Texels, colours: Float32Array, parameters: Float32Array) -> F
 
 
 def _tyre(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-    return mix(colours[0], colours[1], band(np.hypot(texels.u, texels.v), _size(texels), -1.0, 0.19))
+    return mix(
+        colours[0], colours[1], band(np.hypot(texels.u, texels.v), _size(texels), -1.0, 0.19)
+    )
 
 
 def _fence(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
@@ -393,7 +465,9 @@ SHADERS: dict[Material, Shader] = {
     Material.JUNCTION: _junction,
     Material.PAVEMENT: _pavement,
     Material.KERB: _kerb,
-    Material.GRASS: _mottled((24.0, 24.0, 0.3), (8.0, 8.0, 0.35), (2.5, 2.5, 0.35), (0.7, 0.7, 0.4), (0.2, 0.2, 0.4)),
+    Material.GRASS: _mottled(
+        (24.0, 24.0, 0.3), (8.0, 8.0, 0.35), (2.5, 2.5, 0.35), (0.7, 0.7, 0.4), (0.2, 0.2, 0.4)
+    ),
     Material.GRAVEL: _mottled((6.0, 6.0, 0.3), (1.2, 1.2, 0.3), (0.3, 0.3, 0.4), (0.1, 0.1, 0.3)),
     Material.WALL: _wall,
     Material.ROOF: _roof,
@@ -410,7 +484,9 @@ SHADERS: dict[Material, Shader] = {
     Material.BOARDS: _boards,
     Material.CARPET: _carpet,
     Material.WOOD: _wood,
-    Material.FABRIC: _grained((0.6, 0.6, 0.08), (0.12, 0.12, 0.07), (0.02, 0.02, 0.12), (0.008, 0.008, 0.12)),
+    Material.FABRIC: _grained(
+        (0.6, 0.6, 0.08), (0.12, 0.12, 0.07), (0.02, 0.02, 0.12), (0.008, 0.008, 0.12)
+    ),
     Material.BOOKS: _books,
     Material.PICTURE: _picture,
     Material.SCREEN: _screen,

@@ -22,7 +22,9 @@ def build_town(plan: StreetPlan, bend: Bend, seed: int, varied: bool = False) ->
             town.block(i, j)
     if plan.kind == "motorway":  # a barrier between the carriageways
         start, end = float(plan.xs[0]), float(plan.xs[-1])
-        objects.barrier(town.soup, rng, objects.frame_at(start, 0.0, 0.0), end - start, rng.random() < 0.5)
+        objects.barrier(
+            town.soup, rng, objects.frame_at(start, 0.0, 0.0), end - start, rng.random() < 0.5
+        )
     town.backdrop()
     return town.soup.finish(bend)
 
@@ -30,7 +32,9 @@ def build_town(plan: StreetPlan, bend: Bend, seed: int, varied: bool = False) ->
 class _Town:
     """The mesh under construction, with the colours and proportions of one world."""
 
-    def __init__(self, plan: StreetPlan, rng: np.random.Generator, more: np.random.Generator | None) -> None:
+    def __init__(
+        self, plan: StreetPlan, rng: np.random.Generator, more: np.random.Generator | None
+    ) -> None:
         self.plan, self.rng, self.more, self.soup = plan, rng, more, Soup(rng)
         self.density = float(rng.uniform(0.5, 0.9))  # of buildings
         self.parking = float(rng.uniform(0.1, 0.6))  # of cars along the kerb
@@ -39,7 +43,9 @@ class _Town:
         self.tallness = 1.0  # of trees at the kerb
         self.open = plan.kind in ("country", "motorway")  # no houses, no pavements
         self.foot = KERB - (0.1 if more is None else 0.6)  # of houses, below the ground on hills
-        grey = objects.colour(rng, (0.36, 0.36, 0.37), (0.28, 0.28, 0.30), (0.42, 0.41, 0.39), spread=0.03)
+        grey = objects.colour(
+            rng, (0.36, 0.36, 0.37), (0.28, 0.28, 0.30), (0.42, 0.41, 0.39), spread=0.03
+        )
         stone = objects.colour(rng, (0.55, 0.54, 0.52), (0.50, 0.46, 0.43), spread=0.04)
         turf = objects.colour(rng, (0.26, 0.36, 0.14), (0.34, 0.38, 0.18), spread=0.02)
         paint = np.array([0.80, 0.80, 0.76])
@@ -49,8 +55,12 @@ class _Town:
         lines = (plan.half_width, float(dash), float(fraction), float(edged), lanes, smooth)
         soup = self.soup
         self.asphalt = soup.instance(Material.ASPHALT, grey, paint, lines)
-        self.junction = soup.instance(Material.JUNCTION, grey, paint, (0.0, 0.0, 0.0, 0.0, 0.0, smooth))
-        self.pavement = soup.instance(Material.PAVEMENT, stone, 0.7 * stone, (float(rng.uniform(0.5, 1.2)),))
+        self.junction = soup.instance(
+            Material.JUNCTION, grey, paint, (0.0, 0.0, 0.0, 0.0, 0.0, smooth)
+        )
+        self.pavement = soup.instance(
+            Material.PAVEMENT, stone, 0.7 * stone, (float(rng.uniform(0.5, 1.2)),)
+        )
         self.kerb = soup.instance(Material.KERB, 1.15 * stone, 0.6 * stone, (1.0,))
         self.grass = soup.instance(Material.GRASS, turf, 0.55 * turf)
         self.gravel = soup.instance(Material.GRAVEL, 0.9 * stone, 0.5 * stone)
@@ -62,19 +72,27 @@ class _Town:
     def ground(self) -> None:
         """Roads, junctions, and a wide meadow under it all."""
         xs, ys = self.plan.xs, self.plan.ys
-        self._slab((xs[0] - 160.0, ys[0] - 160.0, xs[-1] + 160.0, ys[-1] + 160.0), -0.25, self.grass, 8.0)
+        self._slab(
+            (xs[0] - 160.0, ys[0] - 160.0, xs[-1] + 160.0, ys[-1] + 160.0), -0.25, self.grass, 8.0
+        )
         half = self.plan.half_width
         for i in range(len(xs)):
             for j in range(len(ys)):
                 x, y = float(xs[i]), float(ys[j])
                 if i + 1 < len(xs):
-                    self._corridor((x + half, y - half, float(xs[i + 1]) - half, y + half), (i, j), (i + 1, j))
+                    self._corridor(
+                        (x + half, y - half, float(xs[i + 1]) - half, y + half), (i, j), (i + 1, j)
+                    )
                 if j + 1 < len(ys):
-                    self._corridor((x - half, y + half, x + half, float(ys[j + 1]) - half), (i, j), (i, j + 1))
+                    self._corridor(
+                        (x - half, y + half, x + half, float(ys[j + 1]) - half), (i, j), (i, j + 1)
+                    )
                 neighbours = [(i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)]
                 crossed = any(self.plan.is_street((i, j), other) for other in neighbours)
                 rectangle = (x - half, y - half, x + half, y + half)
-                self._slab(rectangle, 0.0 if crossed else KERB, self.junction if crossed else self.grass)
+                self._slab(
+                    rectangle, 0.0 if crossed else KERB, self.junction if crossed else self.grass
+                )
                 if crossed:
                     # asphalt outside the rounded kerbs, and a hair lower where it runs below the blocks
                     reach = half + ROUNDING
@@ -94,7 +112,9 @@ class _Town:
             points, length = self._grid((y0, x0, y1, x1), 0.0, 2.0)[..., [1, 0, 2]], y1 - y0
         rows, columns = points.shape[:2]
         half = self.plan.half_width
-        v, u = np.meshgrid(np.linspace(-half, half, rows), np.linspace(0.0, length, columns), indexing="ij")
+        v, u = np.meshgrid(
+            np.linspace(-half, half, rows), np.linspace(0.0, length, columns), indexing="ij"
+        )
         self.soup.patch(points, np.stack([u, v], axis=2), self.asphalt)
 
     def _grid(self, rectangle: Rectangle, z: float, step: float) -> FloatArray:
@@ -116,7 +136,9 @@ class _Town:
         x0, x1 = float(plan.xs[i]) + half, float(plan.xs[i + 1]) - half
         y0, y1 = float(plan.ys[j]) + half, float(plan.ys[j + 1]) - half
         nodes = [(i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1)]
-        sides = [plan.is_street(*edge) for edge in zip(nodes, nodes[1:] + nodes[:1])]  # south, east, north, west
+        sides = [
+            plan.is_street(*edge) for edge in zip(nodes, nodes[1:] + nodes[:1])
+        ]  # south, east, north, west
         width = self.pavement_width
         inner = (x0 + width, y0 + width, x1 - width, y1 - width)
         self._pavement((x0, y0, x1, y1), inner, sides)
@@ -135,9 +157,14 @@ class _Town:
         for k in range(4):
             here, after, before = corners[k], corners[(k + 1) % 4], corners[k - 1]
             radius = ROUNDING if sides[k] and sides[k - 1] else 0.01
-            ahead, back = (after - here) / np.linalg.norm(after - here), (before - here) / np.linalg.norm(before - here)
+            ahead, back = (
+                (after - here) / np.linalg.norm(after - here),
+                (before - here) / np.linalg.norm(before - here),
+            )
             for angle in np.linspace(0.0, np.pi / 2.0, 6):
-                rim.append(here + radius * ((1.0 - np.sin(angle)) * back + (1.0 - np.cos(angle)) * ahead))
+                rim.append(
+                    here + radius * ((1.0 - np.sin(angle)) * back + (1.0 - np.cos(angle)) * ahead)
+                )
             reach = float(np.linalg.norm(after - here)) - ROUNDING - 1.0
             rim += [here + along * ahead for along in np.arange(ROUNDING + 2.0, reach, 2.5)]
         edge = np.stack([*rim, rim[0]])
@@ -151,7 +178,9 @@ class _Town:
         lip = ring[[0, 0]].copy()
         lip[..., 2] += 0.004
         towards = inside - edge
-        lip[1, :, :2] += 0.16 * towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 0.16)
+        lip[1, :, :2] += (
+            0.16 * towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 0.16)
+        )
         across = np.stack([np.zeros_like(length), np.full_like(length, 0.16)])
         self.soup.patch(lip, np.stack([np.stack([length] * 2), across], axis=2), self.kerb)
 
@@ -164,7 +193,9 @@ class _Town:
             spot = start + along * ahead + float(rng.uniform(0.55, 1.0)) * inward
             kind = rng.random()
             if kind < 0.45 * self.greenery:
-                objects.tree(self.soup, rng, spot[0], spot[1], float(rng.uniform(4.0, 8.0)) * self.tallness)
+                objects.tree(
+                    self.soup, rng, spot[0], spot[1], float(rng.uniform(4.0, 8.0)) * self.tallness
+                )
             elif kind < 0.55:
                 objects.lamp(self.soup, rng, spot[0], spot[1], -inward)
             elif kind < 0.72:
@@ -174,17 +205,29 @@ class _Town:
         while along < length - 6.5:
             if rng.random() < self.parking:
                 spot = start + along * ahead - 0.95 * inward
-                objects.car(self.soup, rng, objects.frame_at(spot[0], spot[1], angle + rng.normal(0.0, 0.03)))
+                objects.car(
+                    self.soup,
+                    rng,
+                    objects.frame_at(spot[0], spot[1], angle + rng.normal(0.0, 0.03)),
+                )
             along += float(rng.uniform(5.4, 7.5))
         if self.more is None:
             return
-        rng = self.more  # a railing along a part of the kerb, thin posts, and people on the pavement
+        rng = (
+            self.more
+        )  # a railing along a part of the kerb, thin posts, and people on the pavement
         if rng.random() < 0.45 and length > 16.0:
             first, last = np.sort(rng.uniform(6.0, length - 6.0, 2))
             foot = start + first * ahead + float(rng.uniform(0.2, 0.8)) * inward
-            objects.railing(self.soup, rng, objects.frame_at(foot[0], foot[1], angle, KERB), float(last - first))
+            objects.railing(
+                self.soup, rng, objects.frame_at(foot[0], foot[1], angle, KERB), float(last - first)
+            )
         for _ in range(int(rng.poisson(length / 14.0))):
-            spot = start + rng.uniform(5.0, max(length - 5.0, 6.0)) * ahead + rng.uniform(-0.8, 1.6) * inward
+            spot = (
+                start
+                + rng.uniform(5.0, max(length - 5.0, 6.0)) * ahead
+                + rng.uniform(-0.8, 1.6) * inward
+            )
             if rng.random() < 0.6:
                 objects.person(self.soup, rng, float(spot[0]), float(spot[1]))
             else:
@@ -197,13 +240,17 @@ class _Town:
         low, high = np.array(inner[:2]), np.array(inner[2:])
 
         def ground(x: FloatArray, y: FloatArray) -> FloatArray:
-            inwards = np.minimum(np.minimum(x - low[0], high[0] - x), np.minimum(y - low[1], high[1] - y))
+            inwards = np.minimum(
+                np.minimum(x - low[0], high[0] - x), np.minimum(y - low[1], high[1] - y)
+            )
             part = np.clip(inwards / run, 0.0, 1.0)
             return np.asarray(KERB + rise * part * part * (3.0 - 2.0 * part))
 
         points = self._grid(inner, 0.0, 2.0)
         points[..., 2] = ground(points[..., 0], points[..., 1])
-        crop = objects.colour(rng, (0.30, 0.36, 0.14), (0.55, 0.47, 0.26), (0.34, 0.27, 0.20), (0.24, 0.34, 0.13))
+        crop = objects.colour(
+            rng, (0.30, 0.36, 0.14), (0.55, 0.47, 0.26), (0.34, 0.27, 0.20), (0.24, 0.34, 0.13)
+        )
         land = self.grass if rng.random() < 0.4 else soup.instance(Material.GRASS, crop, 0.6 * crop)
         soup.patch(points, points[..., :2], land)
         wood = float(rng.choice([0.0, 1.0, 4.0, 10.0]))  # trees in 100 square metres near the road
@@ -217,12 +264,22 @@ class _Town:
                 x, y = start + rng.uniform(0.0, length) * ahead + far * inward
                 z = float(ground(np.array(x), np.array(y)))
                 if rng.random() < 0.4:
-                    green = objects.colour(rng, (0.20, 0.30, 0.12), (0.32, 0.34, 0.16), (0.14, 0.24, 0.10), spread=0.03)
+                    green = objects.colour(
+                        rng, (0.20, 0.30, 0.12), (0.32, 0.34, 0.16), (0.14, 0.24, 0.10), spread=0.03
+                    )
                     bush = soup.instance(Material.LEAVES, green, 0.45 * green)
                     size = float(rng.uniform(0.5, 1.8))
-                    objects.ball(soup, rng, np.array([x, y, z + 0.4 * size]), np.array([1.0, 1.0, 0.8]) * size, bush)
+                    objects.ball(
+                        soup,
+                        rng,
+                        np.array([x, y, z + 0.4 * size]),
+                        np.array([1.0, 1.0, 0.8]) * size,
+                        bush,
+                    )
                 elif far > 1.5:
-                    objects.tree(soup, rng, float(x), float(y), float(rng.uniform(4.0, 13.0)), z - 0.2)
+                    objects.tree(
+                        soup, rng, float(x), float(y), float(rng.uniform(4.0, 13.0)), z - 0.2
+                    )
             self._edge(frame, length)
 
     def _edge(self, frame: FloatArray, length: float) -> None:
@@ -232,9 +289,17 @@ class _Town:
             if kind < 0.75:
                 objects.barrier(soup, rng, frame, length, kind < 0.25)
             elif kind < 0.87:  # against the noise
-                stone = objects.colour(rng, (0.55, 0.53, 0.48), (0.40, 0.45, 0.40), (0.45, 0.38, 0.30))
+                stone = objects.colour(
+                    rng, (0.55, 0.53, 0.48), (0.40, 0.45, 0.40), (0.45, 0.38, 0.30)
+                )
                 wall = soup.instance(Material.BOARDS, stone, 0.6 * stone, (0.5,))
-                objects.box(soup, frame, np.zeros(3), np.array([length, 0.3, float(rng.uniform(2.5, 5.0))]), wall)
+                objects.box(
+                    soup,
+                    frame,
+                    np.zeros(3),
+                    np.array([length, 0.3, float(rng.uniform(2.5, 5.0))]),
+                    wall,
+                )
         elif kind < 0.3:
             objects.wire_fence(soup, rng, frame, length)
         elif kind < 0.4:
@@ -289,12 +354,16 @@ class _Town:
         for side, start in enumerate(corners):
             length, ahead, inward, _ = _directed(start, corners[(side + 1) % 4])
             for along in np.arange(0.0, length, 9.0):
-                spot = start + (along + rng.uniform(-3, 3)) * ahead - rng.uniform(6.0, 25.0) * inward
+                spot = (
+                    start + (along + rng.uniform(-3, 3)) * ahead - rng.uniform(6.0, 25.0) * inward
+                )
                 if rng.random() < (1.0 if self.open else 0.7):
                     objects.tree(self.soup, rng, spot[0], spot[1], float(rng.uniform(6.0, 13.0)))
                 else:
                     frame = objects.frame_at(spot[0], spot[1], side * np.pi / 2.0 + np.pi, -0.3)
-                    objects.building(self.soup, rng, frame, float(rng.uniform(8, 14)), float(rng.uniform(7, 11)))
+                    objects.building(
+                        self.soup, rng, frame, float(rng.uniform(8, 14)), float(rng.uniform(7, 11))
+                    )
 
 
 def _corners(rectangle: Rectangle) -> FloatArray:

@@ -38,7 +38,9 @@ class Surface:
         """Colour of each hit under white light, ``(3, N)`` at a focal length in pixels."""
         mesh = self.mesh
         tangents = np.take(mesh.tangents, hits.triangle, axis=1)
-        u_size, v_size = _footprint(hits.depth / np.float32(focal_px), hits.rays, hits.normals, tangents)
+        u_size, v_size = _footprint(
+            hits.depth / np.float32(focal_px), hits.rays, hits.normals, tangents
+        )
         corners = np.take(mesh.uv, hits.triangle, axis=2)  # (3, 2, N)
         b1, b2 = hits.barycentric
         u, v = corners[0] + b1 * (corners[1] - corners[0]) + b2 * (corners[2] - corners[0])
@@ -49,7 +51,9 @@ class Surface:
         rgb = np.empty((3, len(hits.triangle)), dtype=np.float32)
         for kind in np.flatnonzero(counts):
             part = slice(int(ends[kind] - counts[kind]), int(ends[kind]))
-            texels = Texels(u[part], v[part], u_size[part], v_size[part], offsets[0, part], offsets[1, part])
+            texels = Texels(
+                u[part], v[part], u_size[part], v_size[part], offsets[0, part], offsets[1, part]
+            )
             colours = np.take(mesh.colours, instance[part], axis=2)
             parameters = np.take(mesh.parameters, instance[part], axis=1)
             rgb[:, part] = SHADERS[Material(kind)](texels, colours, parameters)
@@ -79,7 +83,9 @@ def place_rays(T_scene_sensor: FloatArray, directions: Float32Array) -> Float32A
     if T_scene_sensor.ndim == 3:
         by_row = directions.reshape(len(T_scene_sensor), -1, 3)
         rays[:, :3] = np.repeat(T_scene_sensor[:, :3, 3], by_row.shape[1], axis=0)
-        rays[:, 3:] = (by_row @ T_scene_sensor[:, :3, :3].swapaxes(1, 2).astype(np.float32)).reshape(-1, 3)
+        rays[:, 3:] = (
+            by_row @ T_scene_sensor[:, :3, :3].swapaxes(1, 2).astype(np.float32)
+        ).reshape(-1, 3)
         return rays
     rays[:, :3] = T_scene_sensor[:3, 3]
     rays[:, 3:] = directions @ T_scene_sensor[:3, :3].T.astype(np.float32)
@@ -141,14 +147,22 @@ class SimulatedWorld(ABC):
     camera_height_m: float | None = None
     T_camera_lidar: FloatArray | None = None
 
-    def __init__(self, options: SimulationOptions, camera: Intrinsics, T_scene_camera: FloatArray) -> None:
+    def __init__(
+        self, options: SimulationOptions, camera: Intrinsics, T_scene_camera: FloatArray
+    ) -> None:
         """A world seen through a camera from poses ``(N, 4, 4)``."""
-        self.options, self.camera, self.K = options, replace(camera, readout_s=options.readout_s), camera.K
+        self.options, self.camera, self.K = (
+            options,
+            replace(camera, readout_s=options.readout_s),
+            camera.K,
+        )
         self._T_scene_camera = T_scene_camera
         self.T_world_camera: FloatArray = se3.invert(T_scene_camera[0]) @ T_scene_camera
         self.T_world_camera[0] = np.eye(4)
         self._rays = camera.rays(camera.pixel_grid()).reshape(-1, 3).astype(np.float32)
-        self._stretch = np.linalg.norm(self._rays, axis=1).astype(np.float32)  # ray length per depth
+        self._stretch = np.linalg.norm(self._rays, axis=1).astype(
+            np.float32
+        )  # ray length per depth
 
     @abstractmethod
     def _build(self) -> Mesh:
@@ -164,7 +178,12 @@ class SimulatedWorld(ABC):
 
     @abstractmethod
     def _shade(
-        self, surfaces: list[Surface], number: int, hits: Hits, rays: Float32Array, pixels: NDArray[np.int64]
+        self,
+        surfaces: list[Surface],
+        number: int,
+        hits: Hits,
+        rays: Float32Array,
+        pixels: NDArray[np.int64],
     ) -> Float32Array:
         """Colour ``(3, N)`` of hits on one of the surfaces by rays ``(N, 6)`` through pixels ``(N,)``."""
 
@@ -191,13 +210,17 @@ class SimulatedWorld(ABC):
             rgb, depth = np.mean([view[0] for view in views], axis=0), self.depth(index)
         levels = self._develop(rgb, index) * np.float32(255.0) + np.float32(0.5)
         image = np.clip(levels, 0.0, 255.0).astype(np.uint8)
-        return SimulatedFrame(index, index / self.options.rate, image, depth, self.T_world_camera[index].copy())
+        return SimulatedFrame(
+            index, index / self.options.rate, image, depth, self.T_world_camera[index].copy()
+        )
 
     def depth(self, index: int) -> Float32Array:
         """The z-depth ``(H, W)`` of `render`, without the image."""
         self._require(index)
         rays = place_rays(self._T_scene_camera[index], self._rays)
-        depth: Float32Array = np.min([surface.cast(rays)["t_hit"] for surface in self._surfaces(index)], axis=0)
+        depth: Float32Array = np.min(
+            [surface.cast(rays)["t_hit"] for surface in self._surfaces(index)], axis=0
+        )
         depth[depth >= FARTHEST_M] = 0.0
         return depth.reshape(self.options.height, self.options.width)
 
@@ -224,7 +247,9 @@ class SimulatedWorld(ABC):
         """The surfaces at a frame: what stands still, and what moves."""
         return [self._still, *map(Surface, self._moving(index))]
 
-    def _view(self, surfaces: list[Surface], T_scene_camera: FloatArray) -> tuple[Float32Array, Float32Array]:
+    def _view(
+        self, surfaces: list[Surface], T_scene_camera: FloatArray
+    ) -> tuple[Float32Array, Float32Array]:
         """Colour ``(H, W, 3)``, about [0, 1], and z-depth ``(H, W)`` from a pose, or from one of each row."""
         rays = place_rays(T_scene_camera, self._rays)  # z = 1, so that t is z-depth
         unit = np.ascontiguousarray(rays[:, 3:].T) / self._stretch  # (3, H * W)
@@ -246,7 +271,9 @@ class SimulatedWorld(ABC):
                 triangle=triangle,
                 barycentric=np.take(answer["primitive_uvs"], seen, axis=0).T,
                 rays=rays_seen,
-                normals=np.asarray(normals * -np.sign((normals * rays_seen).sum(axis=0))),  # turned towards the viewer
+                normals=np.asarray(
+                    normals * -np.sign((normals * rays_seen).sum(axis=0))
+                ),  # turned towards the viewer
                 depth=depth[seen],
                 distance=depth[seen] * self._stretch[seen],
             )
@@ -256,7 +283,9 @@ class SimulatedWorld(ABC):
 
     def _require(self, index: int) -> None:
         if not 0 <= index < len(self):
-            raise IndexError(f"the simulated drive has frames 0 to {len(self) - 1}; asked for {index}")
+            raise IndexError(
+                f"the simulated drive has frames 0 to {len(self) - 1}; asked for {index}"
+            )
 
 
 def square_camera(width: int, height: int, fov_deg: float) -> Intrinsics:

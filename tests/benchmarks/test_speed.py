@@ -59,7 +59,10 @@ def test_networks_forward_and_backward(cpu_ms: Clock) -> None:
 
     def step(depth: str, pose: str) -> Callable[[], None]:
         def work() -> None:
-            loss = sum(d.mean() for d in networks[depth](image)) + networks[pose](image, sources).mean()
+            loss = (
+                sum(d.mean() for d in networks[depth](image))
+                + networks[pose](image, sources).mean()
+            )
             loss.backward()
 
         return work

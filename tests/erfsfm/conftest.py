@@ -80,7 +80,9 @@ def write_root() -> WriteRoot:
         size: tuple[int, int] = (64, 96),
         step: tuple[float, float, float] = (0.05, 0.0, 0.1),
     ) -> Path:
-        scene = Plane(Camera(size[1], size[0], 60.0, 62.0, (size[1] - 1) / 2, (size[0] - 1) / 2), 6.0)
+        scene = Plane(
+            Camera(size[1], size[0], 60.0, 62.0, (size[1] - 1) / 2, (size[0] - 1) / 2), 6.0
+        )
         camera = scene.camera
         row = f"{camera.fx} 0 {camera.cx} 0 0 {camera.fy} {camera.cy} 0 0 0 1 0"
         for sequence in sequences:
@@ -125,7 +127,11 @@ def write_raw() -> Callable[..., Path]:
         height, width = size
         rows = [
             f"S_rect_{camera}: {width} {height}\nP_rect_{camera}: 60 0 {cx} 0 0 62 {height // 2 - 2} 0 0 0 1 0\n"
-            for camera, cx in (("00", width // 2 - 1), ("02", width // 2 - 1), ("03", width // 2 - 2))
+            for camera, cx in (
+                ("00", width // 2 - 1),
+                ("02", width // 2 - 1),
+                ("03", width // 2 - 2),
+            )
         ]
         scene = Plane(Camera(width, height, 60.0, 62.0, 47.0, 30.0), 6.0)
         for camera in ("image_02", "image_03"):
@@ -134,12 +140,16 @@ def write_raw() -> Callable[..., Path]:
                 image = scene.image(np.array([0.05, 0, 0.1]) * index)
                 shrunken = cv2.resize(image, (stored or size)[::-1], interpolation=cv2.INTER_AREA)
                 cv2.imwrite(str(home / camera / "data" / f"{index:010d}.png"), shrunken[..., ::-1])
-        (home.parent / "calib_cam_to_cam.txt").write_text("calib_time: 09-Jan-2012 13:57:47\n" + "".join(rows))
+        (home.parent / "calib_cam_to_cam.txt").write_text(
+            "calib_time: 09-Jan-2012 13:57:47\n" + "".join(rows)
+        )
         for index, speed in enumerate(speeds or []):
             (home / "oxts" / "data").mkdir(parents=True, exist_ok=True)
             packet = np.zeros(30)
             packet[[6, 7]] = 0.6 * speed, 0.8 * speed
-            (home / "oxts/data" / f"{index:010d}.txt").write_text(" ".join(f"{number:g}" for number in packet))
+            (home / "oxts/data" / f"{index:010d}.txt").write_text(
+                " ".join(f"{number:g}" for number in packet)
+            )
         return home
 
     return write
@@ -155,7 +165,10 @@ _CONFIGURATIONS = {
 @pytest.fixture(
     params=[
         # a row of table 3 has both networks of the paper
-        pytest.param(name, marks=pytest.mark.slow if re.match("table[12]|erf-|default-(gpu|pose)", name) else ())
+        pytest.param(
+            name,
+            marks=pytest.mark.slow if re.match("table[12]|erf-|default-(gpu|pose)", name) else (),
+        )
         for name in _CONFIGURATIONS.values()
     ]
 )
@@ -168,7 +181,13 @@ def configuration(request: pytest.FixtureRequest) -> str:
 def small() -> dict[str, dict[str, object]]:
     """Settings of an experiment that runs in a second."""
     return {
-        "network": {"depth_width": 0.0625, "pose_width": 0.125, "sources": 2, "height": 32, "width": 64},
+        "network": {
+            "depth_width": 0.0625,
+            "pose_width": 0.125,
+            "sources": 2,
+            "height": 32,
+            "width": 64,
+        },
         "data": {"workers": 0, "validation": [], "cache_mb": 50},
         "training": {"steps": 4, "batch": 2, "checkpoint_every": 2, "validate_every": 2},
     }

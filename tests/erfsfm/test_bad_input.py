@@ -17,7 +17,17 @@ from erfsfm.model_record import ModelRecord
 
 Refusal = Callable[..., str]
 WriteRoot = Callable[..., Path]
-TRAIN = ["train", "--config", "tiny", "--set", "training.steps=1", "--set", "data.workers=0", "--device", "cpu"]
+TRAIN = [
+    "train",
+    "--config",
+    "tiny",
+    "--set",
+    "training.steps=1",
+    "--set",
+    "data.workers=0",
+    "--device",
+    "cpu",
+]
 SMALL = ["--set", "network.height=32", "--set", "network.width=64", "--set", "training.batch=2"]
 
 
@@ -38,27 +48,38 @@ def refusal(command_line: Callable[..., tuple[int, str, str]]) -> Refusal:
 @pytest.fixture
 def weights(tmp_path: Path) -> Path:
     config = NetworkConfig(depth_width=0.0625, pose_width=0.125, height=32, width=64)
-    save_model(tmp_path / "weights", Model(ModelRecord(network=config, trained_on=[]), build_networks(config)))
+    save_model(
+        tmp_path / "weights",
+        Model(ModelRecord(network=config, trained_on=[]), build_networks(config)),
+    )
     return tmp_path / "weights"
 
 
-def test_images_of_mixed_size(refusal: Refusal, tmp_path: Path, write_root: WriteRoot, weights: Path) -> None:
+def test_images_of_mixed_size(
+    refusal: Refusal, tmp_path: Path, write_root: WriteRoot, weights: Path
+) -> None:
     root = write_root(tmp_path / "root", frames=5, size=(64, 96))
     odd = root / "sequences/00/image_2/000002.png"
     cv2.imwrite(str(odd), np.zeros((48, 96, 3), np.uint8))
     wanted = "000002.png is 96 x 48"
     assert wanted in refusal(*TRAIN, *SMALL, "--dataset", root, "--output", tmp_path / "run")
-    assert wanted in refusal("evaluate", "pose", "--dataset", root, "--sequence", "00", "--weights", weights)
+    assert wanted in refusal(
+        "evaluate", "pose", "--dataset", root, "--sequence", "00", "--weights", weights
+    )
 
 
-def test_truncated_image(refusal: Refusal, tmp_path: Path, write_root: WriteRoot, weights: Path) -> None:
+def test_truncated_image(
+    refusal: Refusal, tmp_path: Path, write_root: WriteRoot, weights: Path
+) -> None:
     root = write_root(tmp_path / "root", frames=5, suffix=".jpg")
     image = root / "sequences/00/image_2/000002.jpg"
     image.write_bytes(image.read_bytes()[: image.stat().st_size // 2])
     wanted = "000002.jpg is truncated"
     assert wanted in refusal(*TRAIN, *SMALL, "--dataset", root, "--output", tmp_path / "run")
     assert wanted in refusal("predict", image, "--weights", weights, "--output", tmp_path / "depth")
-    assert wanted in refusal("evaluate", "pose", "--dataset", root, "--sequence", "00", "--weights", weights)
+    assert wanted in refusal(
+        "evaluate", "pose", "--dataset", root, "--sequence", "00", "--weights", weights
+    )
 
 
 @pytest.mark.parametrize("verb", ["predict", "export", "receptive-field"])
@@ -106,4 +127,8 @@ def test_an_output_with_other_peoples_files(refusal: Refusal, tmp_path: Path) ->
     missing = tmp_path / "missing"  # the output is looked at before the data
     error = refusal(*TRAIN, *SMALL, "--dataset", missing, "--output", output)
     assert f"{output} holds files that 'erfsfm train' did not write" in error
-    assert {str(path.relative_to(output)): path.read_text() for path in output.rglob("*") if path.is_file()} == files
+    assert {
+        str(path.relative_to(output)): path.read_text()
+        for path in output.rglob("*")
+        if path.is_file()
+    } == files

@@ -22,7 +22,9 @@ FILES = ("depth.safetensors", "pose.safetensors")
 def fresh(**network: Any) -> Model:
     settings = {"depth_width": 0.0625, "pose_width": 0.125, "normalisation": "batch", "sources": 2}
     config = NetworkConfig.model_validate(settings | network)
-    record = ModelRecord(network=config, trained_on=["simulated/0-9", "kitti_odometry/00[0:250]"], step=12)
+    record = ModelRecord(
+        network=config, trained_on=["simulated/0-9", "kitti_odometry/00[0:250]"], step=12
+    )
     return Model(record, build_networks(config))
 
 
@@ -40,11 +42,19 @@ def refusal(name: str | Path) -> str:
 
 
 def states(model: Model) -> list[torch.Tensor]:
-    return [*model.networks["depth"].state_dict().values(), *model.networks["pose"].state_dict().values()]
+    return [
+        *model.networks["depth"].state_dict().values(),
+        *model.networks["pose"].state_dict().values(),
+    ]
 
 
 @pytest.mark.parametrize(
-    "network", [{}, {"sources": 2}, {"depth": "erf-depthnet-dfcv2", "pose": "erf-posenet-dfc", "fidelity": "paper"}]
+    "network",
+    [
+        {},
+        {"sources": 2},
+        {"depth": "erf-depthnet-dfcv2", "pose": "erf-posenet-dfc", "fidelity": "paper"},
+    ],
 )
 def test_round_trip(tmp_path: Path, network: dict[str, Any]) -> None:
     model = fresh(**network)
@@ -91,7 +101,16 @@ def test_missing_and_unknown_tensors(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "- 1", "a: [", "[" * 800, "format: 1\n", "format: 2\nnetwork: {}\ntrained_on: []\n", "\x00\x01"]
+    "text",
+    [
+        "",
+        "- 1",
+        "a: [",
+        "[" * 800,
+        "format: 1\n",
+        "format: 2\nnetwork: {}\ntrained_on: []\n",
+        "\x00\x01",
+    ],
 )
 def test_bad_record(folder: Path, text: str) -> None:
     (folder / "model.yaml").write_text(text)
@@ -124,14 +143,20 @@ def made(name: str, width: float = 0.25, seed: int = 0) -> torch.nn.Module:
         ("erf-posenet-dfc", "posenet"),
     ],
 )
-def test_a_network_with_zero_offsets_has_the_same_output_in_another_variant(first: str, second: str):
+def test_a_network_with_zero_offsets_has_the_same_output_in_another_variant(
+    first: str, second: str
+):
     trained, fresh = made(first), made(second, seed=1)
     for key, value in trained.named_parameters():
         if key.endswith(".bias"):
             torch.nn.init.zeros_(value)  # a deformable kernel has none
     take_over(fresh, trained.state_dict())
     image = torch.rand(1, 3, 64, 96)
-    seen = (image,) if "depth" in first else (image, [image.flip(3), image.flip(2), image, image * 0.5])
+    seen = (
+        (image,)
+        if "depth" in first
+        else (image, [image.flip(3), image.flip(2), image, image * 0.5])
+    )
     torch.testing.assert_close(fresh(*seen), trained(*seen), rtol=1e-4, atol=1e-5)
 
 

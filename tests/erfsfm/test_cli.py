@@ -59,7 +59,9 @@ assert not heavy, heavy
 
 
 def test_help_of_every_command_loads_no_heavy_library() -> None:
-    finished = subprocess.run([sys.executable, "-c", HELP], capture_output=True, text=True, check=False)
+    finished = subprocess.run(
+        [sys.executable, "-c", HELP], capture_output=True, text=True, check=False
+    )
     assert finished.returncode == 0, finished.stderr
     assert {
         "train",
@@ -78,15 +80,33 @@ def test_help_of_every_command_loads_no_heavy_library() -> None:
     [
         (["train", "--config", "nothing"], "no configuration file or name 'nothing'"),
         (["train", "--config", "tiny", "--dataset", "nowhere"], "does not exist"),
-        (["train", "--config", "tiny", "--set", "training.stepz=1"], "did you mean 'training.steps'"),
+        (
+            ["train", "--config", "tiny", "--set", "training.stepz=1"],
+            "did you mean 'training.steps'",
+        ),
         (["predict", "nowhere.png"], "no weights 'default'"),
         (["predict", "nowhere.png", "--weights", "{weights}"], "nowhere.png"),
-        (["train", "--config", "tiny", "--dataset", "{root}", "--output", "new", "--resume"], "start without --resume"),
+        (
+            ["train", "--config", "tiny", "--dataset", "{root}", "--output", "new", "--resume"],
+            "start without --resume",
+        ),
         (["convert", "{image}", "--output", "new"], "damaged, no checkpoint"),
         (["export", "--weights", "{weights}", "--output", "net.pt"], "must end in .onnx"),
         (["receptive-field", "--output", "field.txt"], ".png, .pdf, .svg"),
         (["evaluate", "depth", "--dataset", "nowhere", "--weights", "{weights}"], "does not exist"),
-        (["evaluate", "pose", "--dataset", "{root}", "--sequence", "44", "--weights", "{weights}"], "found 00"),
+        (
+            [
+                "evaluate",
+                "pose",
+                "--dataset",
+                "{root}",
+                "--sequence",
+                "44",
+                "--weights",
+                "{weights}",
+            ],
+            "found 00",
+        ),
     ],
 )
 def test_errors_are_one_line(
@@ -118,13 +138,23 @@ def test_networks_json(run: Run) -> None:
     code, out, err = run("networks", "--json", "--fidelity", "paper")
     assert (code, err) == (0, "")
     rows: list[dict[str, Any]] = json.loads(out)
-    assert [row["name"] for row in rows] == [name for name, preset in PRESETS.items() if preset.encoder == "paper"]
-    assert all({"name", "kind", "parameters", "multiply_adds", "receptive_field"} <= row.keys() for row in rows)
+    assert [row["name"] for row in rows] == [
+        name for name, preset in PRESETS.items() if preset.encoder == "paper"
+    ]
+    assert all(
+        {"name", "kind", "parameters", "multiply_adds", "receptive_field"} <= row.keys()
+        for row in rows
+    )
     by_name = {row["name"]: row for row in rows}
     assert by_name["depthnet"]["parameters"] == 31_596_900
     assert by_name["erf-posenet-dfc"]["parameters"] == 1_776_479
     assert by_name["depthnet"]["multiply_adds"] == pytest.approx(3.67e9, rel=0.01)
-    fields = {"posenet": 263, "erf-posenet-dilated": 301, "depthnet": 787, "erf-depthnet-dilated": 829}
+    fields = {
+        "posenet": 263,
+        "erf-posenet-dilated": 301,
+        "depthnet": 787,
+        "erf-depthnet-dilated": 829,
+    }
     assert {name: by_name[name]["receptive_field"] for name in fields} == fields
     impossible = [row["name"] for row in rows if row["multiply_adds"] is None]
     assert impossible == ["erf-depthnet-dilated"]
@@ -134,10 +164,21 @@ def test_networks_json(run: Run) -> None:
 
 
 @pytest.mark.slow
-def test_receptive_field(run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]) -> None:
+def test_receptive_field(
+    run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]
+) -> None:
     images = write_root(tmp_path / "root", frames=6) / "sequences/00/image_2"
     picture = tmp_path / "new/field.png"
-    options = ["--network", "erf-posenet-dilated", "--height", "64", "--width", "96", "--output", picture]
+    options = [
+        "--network",
+        "erf-posenet-dilated",
+        "--height",
+        "64",
+        "--width",
+        "96",
+        "--output",
+        picture,
+    ]
     plain = ["--network", "posenet", "--weights", weights, "--images", images]
     code, out, err = run("receptive-field", *plain, *options)
     assert (code, err) == (0, "")
@@ -147,8 +188,12 @@ def test_receptive_field(run: Run, tmp_path: Path, weights: Path, write_root: Ca
     assert (code, err) == (0, "")
     rows = json.loads(out)
     assert [row["theoretical_px"] for row in rows] == [511, 339, 301]
-    assert (rows[0]["theoretical_at_rest_px"], rows[0]["offsets_px"]) == (263, 1.0), "taps are pushed outwards"
-    assert [row["share_of_all_outputs"] for row in rows[1:]] == [1.0, pytest.approx(0.25)], "the paper's skips rows"
+    assert (rows[0]["theoretical_at_rest_px"], rows[0]["offsets_px"]) == (263, 1.0), (
+        "taps are pushed outwards"
+    )
+    assert [row["share_of_all_outputs"] for row in rows[1:]] == [1.0, pytest.approx(0.25)], (
+        "the paper's skips rows"
+    )
     assert {row["weights"] for row in rows} == {"untrained"}
 
 
@@ -163,7 +208,10 @@ def test_predict_leaves_out_what_it_cannot_read(
     old = ["--seed", "3"]  # accepted where nothing is random
     code, out, _ = run("predict", images, "--weights", weights, "--output", depth, *old)
     assert code == 0 and f"depth of 2 images in {depth}" in out
-    assert "1 of 3 images cannot be read and are left out" in caplog.text and "b.png is truncated" in caplog.text
+    assert (
+        "1 of 3 images cannot be read and are left out" in caplog.text
+        and "b.png is truncated" in caplog.text
+    )
     assert sorted(p.name for p in depth.iterdir()) == ["a.npy", "a.png", "c.npy", "c.png"]
     assert np.load(depth / "a.npy").shape == (20, 30)
 
@@ -198,7 +246,9 @@ def test_predict_replaces_earlier_predictions_alone(
     assert {path.name: path.read_bytes() for path in depth.iterdir()} == before
 
 
-def test_evaluate_depth(run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]) -> None:
+def test_evaluate_depth(
+    run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]
+) -> None:
     root = write_root(tmp_path / "root", frames=6, depth=True, seed=600)
     code, out, err = run("evaluate", "depth", "--weights", weights, "--dataset", root, "--json")
     assert (code, err) == (0, "")
@@ -210,14 +260,18 @@ def test_evaluate_depth(run: Run, tmp_path: Path, weights: Path, write_root: Cal
     code, out, _ = run("evaluate", "depth", "--weights", weights, "--dataset", root)
     assert code == 0
     head, _, *rows = [line.strip() for line in out.splitlines() if line.strip()]
-    assert head.split()[:2] == ["method", "abs_rel"] and [row[: len("median depth map")] for row in rows] == [
-        "networks        ",
-        "median depth map",
-    ]
-    assert all(row[: head.index("abs_rel") + len("abs_rel")].split()[-1].replace(".", "").isdigit() for row in rows)
+    assert head.split()[:2] == ["method", "abs_rel"] and [
+        row[: len("median depth map")] for row in rows
+    ] == ["networks        ", "median depth map"]
+    assert all(
+        row[: head.index("abs_rel") + len("abs_rel")].split()[-1].replace(".", "").isdigit()
+        for row in rows
+    )
 
 
-def test_evaluate_refuses_a_leak(run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]) -> None:
+def test_evaluate_refuses_a_leak(
+    run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]
+) -> None:
     root = write_root(tmp_path / "root", frames=6, depth=True, seed=17)
     for verb in (("depth",), ("pose", "--sequence", "00")):
         arguments = ("evaluate", *verb, "--weights", weights, "--dataset", root, "--json")
@@ -230,9 +284,13 @@ def test_evaluate_refuses_a_leak(run: Run, tmp_path: Path, weights: Path, write_
         assert any(row["leak"] is True for row in json.loads(out))
 
 
-def test_evaluate_pose(run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]) -> None:
+def test_evaluate_pose(
+    run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]
+) -> None:
     root = write_root(tmp_path / "root", frames=7, step=(0.0, 0.0, 0.1))
-    code, out, _ = run("evaluate", "pose", "--weights", weights, "--dataset", root, "--sequence", "00", "--json")
+    code, out, _ = run(
+        "evaluate", "pose", "--weights", weights, "--dataset", root, "--sequence", "00", "--json"
+    )
     assert code == 0
     networks, straight = json.loads(out)
     assert networks["snippets"] == straight["snippets"] == 3
@@ -243,14 +301,38 @@ def test_evaluate_pose(run: Run, tmp_path: Path, weights: Path, write_root: Call
 
 def test_train_and_resume(run: Run, tmp_path: Path, write_root: Callable[..., Path]) -> None:
     root = write_root(tmp_path / "root", frames=6, seed=3)
-    small = ["network.depth_width=0.0625", "network.pose_width=0.125", "network.height=32", "network.width=64"]
-    steps = ["training.steps=2", "training.batch=2", "training.checkpoint_every=1", "data.workers=0"]
-    arguments = ["train", "--config", "tiny", "--dataset", root, "--output", tmp_path / "run", "--device", "cpu"]
+    small = [
+        "network.depth_width=0.0625",
+        "network.pose_width=0.125",
+        "network.height=32",
+        "network.width=64",
+    ]
+    steps = [
+        "training.steps=2",
+        "training.batch=2",
+        "training.checkpoint_every=1",
+        "data.workers=0",
+    ]
+    arguments = [
+        "train",
+        "--config",
+        "tiny",
+        "--dataset",
+        root,
+        "--output",
+        tmp_path / "run",
+        "--device",
+        "cpu",
+    ]
     for change in (*small, *steps):
         arguments += ["--set", change]
     code, out, err = run(*arguments, "--seed", "5")
-    assert code == 0 and all(line.startswith("steps") for line in err.splitlines()), "said after ten seconds"
-    assert f"erfsfm evaluate depth --weights {tmp_path / 'run'}" in out, "how to see how good they are"
+    assert code == 0 and all(line.startswith("steps") for line in err.splitlines()), (
+        "said after ten seconds"
+    )
+    assert f"erfsfm evaluate depth --weights {tmp_path / 'run'}" in out, (
+        "how to see how good they are"
+    )
     code, _, err = run(*arguments)
     assert code == 1
     assert "--resume" in err

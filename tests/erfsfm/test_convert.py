@@ -37,10 +37,14 @@ class OldDeformable(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         mask = 2 * self.modulator_conv(x).sigmoid()
         kernel = self.regular_conv.weight
-        return deform_conv2d(x, self.offset_conv(x), kernel, stride=self.stride, padding=self.padding, mask=mask)
+        return deform_conv2d(
+            x, self.offset_conv(x), kernel, stride=self.stride, padding=self.padding, mask=mask
+        )
 
 
-def _layer(inside: int, outside: int, kernel: int, stride: int, deformable: bool, dilation: int = 1) -> nn.Module:
+def _layer(
+    inside: int, outside: int, kernel: int, stride: int, deformable: bool, dilation: int = 1
+) -> nn.Module:
     if deformable:
         return OldDeformable(inside, outside, kernel, stride)
     return nn.Conv2d(inside, outside, kernel, stride, (kernel - 1) // 2, dilation)
@@ -80,7 +84,9 @@ class OldDisp(nn.Module):
             if level > 1:
                 parts.append(maps[level - 1])
             if disparity is not None:
-                double = F.interpolate(disparity, scale_factor=2, mode="bilinear", align_corners=False)
+                double = F.interpolate(
+                    disparity, scale_factor=2, mode="bilinear", align_corners=False
+                )
                 parts.append(double[..., : size[0], : size[1]])
             features = layer[f"iconv{level}"](torch.cat(parts, 1))
             if level <= 4:
@@ -93,23 +99,32 @@ class OldPose(nn.Module):
     """PoseExpNet by the table of its layers, at a quarter of its width."""
 
     def __init__(
-        self, deformable: frozenset[int] = PLAIN, dilated: frozenset[int] = PLAIN, sources: int = 4, masks: bool = False
+        self,
+        deformable: frozenset[int] = PLAIN,
+        dilated: frozenset[int] = PLAIN,
+        sources: int = 4,
+        masks: bool = False,
     ) -> None:
         super().__init__()
         self.sources = sources
         planes = [4, 8, 16, 32, 64, 64, 64]
         for i, (inside, outside) in enumerate(zip([3 + 3 * sources, *planes], planes), start=1):
-            layer = _layer(inside, outside, KERNELS[i - 1], 2, i in deformable, 2 if i in dilated else 1)
+            layer = _layer(
+                inside, outside, KERNELS[i - 1], 2, i in deformable, 2 if i in dilated else 1
+            )
             self.add_module(f"conv{i}", nn.Sequential(layer, nn.ReLU()))
         self.pose_pred = nn.Conv2d(planes[-1], 6 * sources, 1)
         if masks:
             ups = [64, 32, 16, 8, 4]
             for n, (inside, outside) in enumerate(zip([planes[4], *ups], ups)):
                 self.add_module(
-                    f"upconv{5 - n}", nn.Sequential(nn.ConvTranspose2d(inside, outside, 4, 2, 1), nn.ReLU())
+                    f"upconv{5 - n}",
+                    nn.Sequential(nn.ConvTranspose2d(inside, outside, 4, 2, 1), nn.ReLU()),
                 )
                 if n:
-                    self.add_module(f"predict_mask{5 - n}", nn.Conv2d(outside, sources, 3, padding=1))
+                    self.add_module(
+                        f"predict_mask{5 - n}", nn.Conv2d(outside, sources, 3, padding=1)
+                    )
 
     def forward(self, images: Tensor) -> Tensor:
         layer = dict(self.named_children())
@@ -152,8 +167,13 @@ def test_depth(tmp_path: Path, pose_file: Path, preset: str, deformable: frozens
     model = load_model(tmp_path / "new")
     assert model.record.network.depth == preset
     assert model.record.network.depth_width == QUARTER
-    wanted, found = list(old.state_dict().values()), list(model.networks["depth"].state_dict().values())
-    assert sorted(v.sum().item() for v in wanted) == sorted(v.sum().item() for v in found), "every value, once"
+    wanted, found = (
+        list(old.state_dict().values()),
+        list(model.networks["depth"].state_dict().values()),
+    )
+    assert sorted(v.sum().item() for v in wanted) == sorted(v.sum().item() for v in found), (
+        "every value, once"
+    )
     image = torch.rand(1, 3, 64, 128) * 2 - 1
     with torch.no_grad():
         torch.testing.assert_close(model.networks["depth"](image), old(image), rtol=1e-5, atol=1e-6)
@@ -169,7 +189,12 @@ def test_depth(tmp_path: Path, pose_file: Path, preset: str, deformable: frozens
     ],
 )
 def test_pose(
-    tmp_path: Path, preset: str, deformable: frozenset[int], dilated: frozenset[int], masks: bool, sources: int
+    tmp_path: Path,
+    preset: str,
+    deformable: frozenset[int],
+    dilated: frozenset[int],
+    masks: bool,
+    sources: int,
 ) -> None:
     old = OldPose(frozenset(deformable), dilated, sources, masks).eval()
     convert([save(old, tmp_path / "pose.pth.tar")], tmp_path / "new", dilated=bool(dilated))
@@ -179,21 +204,36 @@ def test_pose(
     images = list(torch.rand(1 + sources, 1, 3, 64, 128) * 2 - 1)
     with torch.no_grad():
         pose = old(torch.cat(images, dim=1))
-        torch.testing.assert_close(model.networks["pose"](images[0], images[1:]), pose, rtol=1e-5, atol=1e-7)
+        torch.testing.assert_close(
+            model.networks["pose"](images[0], images[1:]), pose, rtol=1e-5, atol=1e-7
+        )
 
 
 def test_the_record(tmp_path: Path, depth_file: Path, pose_file: Path) -> None:
-    convert([pose_file, depth_file], tmp_path / "new", size=(94, 310), trained_on=["kitti_odometry/00"], command="me")
+    convert(
+        [pose_file, depth_file],
+        tmp_path / "new",
+        size=(94, 310),
+        trained_on=["kitti_odometry/00"],
+        command="me",
+    )
     record = load_model(tmp_path / "new").record
     assert (record.network.height, record.network.width) == (94, 310)
-    assert (record.trained_on, record.command, record.networks) == (["kitti_odometry/00"], "me", "both")
+    assert (record.trained_on, record.command, record.networks) == (
+        ["kitti_odometry/00"],
+        "me",
+        "both",
+    )
     convert([pose_file, depth_file], tmp_path / "unknown")
     assert load_model(tmp_path / "unknown").record.trained_on == ["unknown"]
 
 
 def test_one_network_alone(tmp_path: Path, depth_file: Path) -> None:
     convert([depth_file], tmp_path / "new")
-    assert sorted(p.name for p in (tmp_path / "new").iterdir()) == ["depth.safetensors", "model.yaml"]
+    assert sorted(p.name for p in (tmp_path / "new").iterdir()) == [
+        "depth.safetensors",
+        "model.yaml",
+    ]
     model = load_model(tmp_path / "new")
     assert [*model.networks] == ["depth"]
     predictor = DepthPosePredictor.from_weights(tmp_path / "new")
@@ -221,7 +261,9 @@ def test_nothing_is_executed(tmp_path: Path, form: str) -> None:
         path.write_bytes(pickle.dumps(Malicious(trace)))
     else:
         payload = (
-            {"state_dict": state, "epoch": Malicious(trace)} if form != "hidden" else state | {"x": Malicious(trace)}
+            {"state_dict": state, "epoch": Malicious(trace)}
+            if form != "hidden"
+            else state | {"x": Malicious(trace)}
         )
         torch.save(payload, path, _use_new_zipfile_serialization=form != "legacy")
     message = refusal(path)
@@ -248,4 +290,6 @@ def test_other_networks(tmp_path: Path, depth_file: Path, pose_file: Path) -> No
     assert "neither DispNetS nor PoseExpNet" in refusal(tmp_path / "resnet.pth.tar")
     assert "both hold a depth network" in refusal(depth_file, depth_file)
     assert "another architecture" in refusal(_edited(depth_file, iconv3__0__weight=None))
-    assert "which DispNetS and PoseExpNet do not have" in refusal(_edited(pose_file, conv8__0__weight=torch.zeros(2)))
+    assert "which DispNetS and PoseExpNet do not have" in refusal(
+        _edited(pose_file, conv8__0__weight=torch.zeros(2))
+    )

@@ -25,7 +25,9 @@ POSE = [name for name, preset in PRESETS.items() if preset.kind == "pose"]
 
 def fresh(**settings: Any) -> Model:
     """Small networks whose deformable taps really move."""
-    config = NetworkConfig.model_validate({"depth_width": 0.1, "pose_width": 0.2, "height": 64, "width": 96} | settings)
+    config = NetworkConfig.model_validate(
+        {"depth_width": 0.1, "pose_width": 0.2, "height": 64, "width": 96} | settings
+    )
     nets = build_networks(config)
     for module in (m for net in nets.values() for m in net.modules()):
         if isinstance(module, DeformableConv2d):
@@ -53,21 +55,36 @@ def onnx_output(path: Path, **inputs: torch.Tensor) -> np.ndarray:
 )
 @pytest.mark.parametrize(
     "settings",
-    [pytest.param({}, marks=pytest.mark.slow), {"normalisation": "batch", "sources": 2, "height": 47, "width": 78}],
+    [
+        pytest.param({}, marks=pytest.mark.slow),
+        {"normalisation": "batch", "sources": 2, "height": 47, "width": 78},
+    ],
     ids=str,
 )
 def test_all_presets(tmp_path: Path, depth: str, pose: str, settings: dict[str, Any]) -> None:
     model = fresh(depth=depth, pose=pose, **settings)
     export_onnx(model, tmp_path / "net.onnx")
     written = export_onnx(model, tmp_path / "net.onnx")  # its own files are replaced
-    assert [(file.path.name, file.preset) for file in written] == [("net.onnx", depth), ("net_pose.onnx", pose)]
+    assert [(file.path.name, file.preset) for file in written] == [
+        ("net.onnx", depth),
+        ("net_pose.onnx", pose),
+    ]
     assert all(file.difference < 1e-4 for file in written)
     config = model.record.network
     images = torch.rand(1 + config.sources, 1, 3, config.height, config.width) * 2 - 1
     with torch.no_grad():
-        disparity, vectors = model.networks["depth"](images[0]), model.networks["pose"](images[0], list(images[1:]))
-    np.testing.assert_allclose(onnx_output(tmp_path / "net.onnx", image=images[0]), disparity, rtol=1e-4)
-    found = onnx_output(tmp_path / "net_pose.onnx", target=images[0], sources=images[1:].transpose(0, 1).contiguous())
+        disparity, vectors = (
+            model.networks["depth"](images[0]),
+            model.networks["pose"](images[0], list(images[1:])),
+        )
+    np.testing.assert_allclose(
+        onnx_output(tmp_path / "net.onnx", image=images[0]), disparity, rtol=1e-4
+    )
+    found = onnx_output(
+        tmp_path / "net_pose.onnx",
+        target=images[0],
+        sources=images[1:].transpose(0, 1).contiguous(),
+    )
     np.testing.assert_allclose(found, vectors, atol=1e-4 * float(vectors.abs().max()))
 
 
@@ -80,7 +97,10 @@ def test_a_file_that_nobody_named_is_not_replaced(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "pose",
-    ["erf-posenet-dilated", *(pytest.param(f"erf-posenet-{n}", marks=pytest.mark.slow) for n in ("dfc", "dfcv2"))],
+    [
+        "erf-posenet-dilated",
+        *(pytest.param(f"erf-posenet-{n}", marks=pytest.mark.slow) for n in ("dfc", "dfcv2")),
+    ],
 )
 def test_paper_fidelity(tmp_path: Path, pose: str) -> None:
     model = fresh(pose=pose, fidelity="paper", width=160, height=128)

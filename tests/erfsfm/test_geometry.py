@@ -42,7 +42,9 @@ def test_the_paper_resizes_without_half_pixels() -> None:
     kitti = Camera(1241, 376, 718.856, 718.856, 607.1928, 185.2157)
     paper = kitti.resized(416, 128, "paper")
     assert (paper.width, paper.height) == (416, 128)
-    np.testing.assert_allclose([paper.fx, paper.fy, paper.cx, paper.cy], [240.97, 244.717, 203.54, 63.052], atol=5e-3)
+    np.testing.assert_allclose(
+        [paper.fx, paper.fy, paper.cx, paper.cy], [240.97, 244.717, 203.54, 63.052], atol=5e-3
+    )
     assert kitti.resized(416, 128).cx == pytest.approx(203.207, abs=1e-3)
 
 
@@ -56,14 +58,18 @@ def test_project_then_resize(size: tuple[int, int]) -> None:
 def test_project_then_crop() -> None:
     cropped = CAMERA.cropped(17, 5, 100, 80)
     assert (cropped.width, cropped.height) == (100, 80)
-    np.testing.assert_allclose(project(cropped, POINTS), project(CAMERA, POINTS) - [17, 5], atol=1e-4)
+    np.testing.assert_allclose(
+        project(cropped, POINTS), project(CAMERA, POINTS) - [17, 5], atol=1e-4
+    )
 
 
 def test_project_then_flip() -> None:
     pixels = project(CAMERA, POINTS)
     mirrored = POINTS * [-1, 1, 1]
     np.testing.assert_allclose(
-        project(CAMERA.flipped(), mirrored), np.column_stack([399 - pixels[:, 0], pixels[:, 1]]), atol=1e-4
+        project(CAMERA.flipped(), mirrored),
+        np.column_stack([399 - pixels[:, 0], pixels[:, 1]]),
+        atol=1e-4,
     )
 
 
@@ -72,10 +78,14 @@ def test_scale_intrinsics_of_the_paper() -> None:
     K = torch.tensor([[[200.0, 0, 124], [0, 210, 37], [0, 0, 1]]])
     level = scale_intrinsics(K, (10, 31), (75, 248), "paper")[0]
     ratio = 10 / 75
-    expected = torch.tensor([[200 * ratio, 0, 124 * ratio], [0, 210 * ratio, 37 * ratio], [0, 0, 1]])
+    expected = torch.tensor(
+        [[200 * ratio, 0, 124 * ratio], [0, 210 * ratio, 37 * ratio], [0, 0, 1]]
+    )
     torch.testing.assert_close(level, expected)
     exact = scale_intrinsics(K, (10, 31), (75, 248), "default")[0]
-    assert float(level[0, 0] / exact[0, 0]) == pytest.approx(1.067, abs=1e-3), "the reference's 6.7 % error"
+    assert float(level[0, 0] / exact[0, 0]) == pytest.approx(1.067, abs=1e-3), (
+        "the reference's 6.7 % error"
+    )
 
 
 def test_backproject_hand_value() -> None:
@@ -90,7 +100,9 @@ def test_backproject_undoes_project() -> None:
     depth = torch.rand(2, 1, 5, 7).double() + 1
     K = torch.from_numpy(CAMERA.resized(7, 5).K).double().expand(2, 3, 3)
     homogeneous = K @ backproject(depth, K)
-    torch.testing.assert_close(homogeneous / homogeneous[:, 2:], pixel_grid(5, 7, depth).expand(2, 3, 35))
+    torch.testing.assert_close(
+        homogeneous / homogeneous[:, 2:], pixel_grid(5, 7, depth).expand(2, 3, 35)
+    )
 
 
 def test_backproject_gradient() -> None:
@@ -112,7 +124,9 @@ def test_euler_is_scipys_intrinsic_xyz(angle: float) -> None:
 def test_translation_comes_first() -> None:
     T = pose_vector_to_matrix(torch.tensor([1.0, 2.0, 3.0, 0.0, 0.0, math.pi]))
     assert T[:3, 3].tolist() == [1, 2, 3]
-    torch.testing.assert_close(T[:3, :3], torch.diag(torch.tensor([-1.0, -1.0, 1.0])), rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        T[:3, :3], torch.diag(torch.tensor([-1.0, -1.0, 1.0])), rtol=0, atol=1e-6
+    )
     assert T[3].tolist() == [0, 0, 0, 1]
 
 
@@ -134,7 +148,9 @@ def moved(*translation: float) -> Tensor:
 def test_identity_returns_the_image_with_its_border(size: tuple[int, int]) -> None:
     image = torch.rand(1, 3, *size)
     depth = torch.rand(1, 1, *size) * 90 + 0.1
-    K = torch.tensor([[[0.58 * size[1], 0, 0.49 * size[1]], [0, 1.92 * size[0], 0.51 * size[0]], [0, 0, 1]]])
+    K = torch.tensor(
+        [[[0.58 * size[1], 0, 0.49 * size[1]], [0, 1.92 * size[0], 0.51 * size[0]], [0, 0, 1]]]
+    )
     grid, valid = project_into_source(depth, torch.eye(4)[None], K)
     assert valid.all(), "round-off must not cut the border off"
     torch.testing.assert_close(sample(image, grid), image, rtol=0, atol=2e-4)
@@ -145,7 +161,9 @@ def test_sideways_motion_shifts_a_plane_by_whole_pixels(shift: int) -> None:
     """A plane at 5 m, focal length 50: the source sees its points ``50 t / 5`` pixels further right."""
     width, height = 40, 20
     image = torch.rand(1, 3, height, width)
-    grid, valid = project_into_source(torch.full((1, 1, height, width), 5.0), moved(shift * 0.1, 0, 0), camera(40, 20))
+    grid, valid = project_into_source(
+        torch.full((1, 1, height, width), 5.0), moved(shift * 0.1, 0, 0), camera(40, 20)
+    )
     warped = sample(image, grid)
     expected = torch.roll(image, -shift, dims=3)
     inside = torch.zeros(width, dtype=torch.bool)
@@ -165,7 +183,9 @@ def test_forward_motion_by_hand() -> None:
 def test_points_behind_the_camera_are_invalid() -> None:
     depth = torch.full((1, 1, 11, 11), 3.0)
     assert not project_into_source(depth, moved(0, 0, -5), camera(11, 11))[1].any()
-    assert not project_into_source(depth, moved(0, 0, -3), camera(11, 11))[1].any(), "nor those in its plane"
+    assert not project_into_source(depth, moved(0, 0, -3), camera(11, 11))[1].any(), (
+        "nor those in its plane"
+    )
 
 
 @pytest.mark.parametrize("bad", [float("inf"), float("nan"), 1e30])
@@ -203,7 +223,9 @@ def test_warp_finds_the_target_in_a_rendered_source(plane) -> None:
     source = torch.from_numpy(plane.colours(there)).permute(2, 0, 1)[None]
     T_source_target = moved(*(-there)).double()
     depth = torch.full((1, 1, 64, 96), plane.distance).double()
-    grid, valid = project_into_source(depth, T_source_target, torch.from_numpy(plane.camera.K)[None].double())
+    grid, valid = project_into_source(
+        depth, T_source_target, torch.from_numpy(plane.camera.K)[None].double()
+    )
     error = (sample(source, grid) - target).abs()[valid.expand_as(target)]
     assert valid.float().mean() > 0.6
     assert float(error.mean()) < 5e-3

@@ -22,9 +22,13 @@ RNG = np.random.default_rng(3)
 
 
 def model(sources: Literal[2, 4] = 4, pose: str = "posenet") -> Model:
-    config = NetworkConfig(depth_width=0.0625, pose=pose, pose_width=0.125, height=32, width=64, sources=sources)
+    config = NetworkConfig(
+        depth_width=0.0625, pose=pose, pose_width=0.125, height=32, width=64, sources=sources
+    )
     torch.manual_seed(0)
-    return Model(ModelRecord(network=config, trained_on=["kitti_odometry/00[0:250]"]), build_networks(config))
+    return Model(
+        ModelRecord(network=config, trained_on=["kitti_odometry/00[0:250]"]), build_networks(config)
+    )
 
 
 @pytest.fixture
@@ -153,5 +157,9 @@ def test_from_weights(tmp_path: Path) -> None:
 
 
 def test_leaks(predictor: DepthPosePredictor) -> None:
-    names = ["kitti_odometry/00[249:260]", "kitti_odometry/00[250:260]", "kitti_raw/2011_10_03_drive_0027"]
+    names = [
+        "kitti_odometry/00[249:260]",
+        "kitti_odometry/00[250:260]",
+        "kitti_raw/2011_10_03_drive_0027",
+    ]
     assert predictor.leaks(names) == [names[0], names[2]]

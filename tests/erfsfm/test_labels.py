@@ -44,9 +44,14 @@ def grey(frame: int) -> NDArray[np.uint8]:
     return long_street().render(frame).image[..., 1].copy()
 
 
-def seen(frame: int, others: tuple[int, ...]) -> tuple[NDArray[np.uint8], list[NDArray[np.uint8]], Array, Array]:
+def seen(
+    frame: int, others: tuple[int, ...]
+) -> tuple[NDArray[np.uint8], list[NDArray[np.uint8]], Array, Array]:
     """A frame, its neighbours, their camera, and ``T_neighbour_target`` in camera heights."""
-    T = np.linalg.inv(long_street().T_world_camera[[frame + k for k in others]]) @ long_street().T_world_camera[frame]
+    T = (
+        np.linalg.inv(long_street().T_world_camera[[frame + k for k in others]])
+        @ long_street().T_world_camera[frame]
+    )
     T[:, :3, 3] /= long_street().camera_height_m
     return grey(frame), [grey(frame + k) for k in others], long_street().K, T
 
@@ -60,7 +65,9 @@ def by_flow(frame: int) -> tuple[Array, Array]:
 def truth(frame: int) -> Array:
     """Inverse depth in camera heights, 0 where it is unknown."""
     depth = long_street().depth(frame)
-    return np.where(depth > 0, long_street().camera_height_m / np.maximum(depth, 1e-6), 0).astype(np.float32)
+    return np.where(depth > 0, long_street().camera_height_m / np.maximum(depth, 1e-6), 0).astype(
+        np.float32
+    )
 
 
 def errors(bounds: tuple[Array, Array], true: Array) -> tuple[Array, float]:
@@ -104,7 +111,9 @@ def test_direction_of_travel_is_forward_and_unknown_at_rest():
 
 
 def test_more_is_known_than_by_flow_alone_and_it_is_as_right() -> None:
-    network = 7 * cv2.GaussianBlur(truth(FRAME), (0, 0), 4) ** np.float32(0.9) + np.float32(0.05)  # in its own unit
+    network = 7 * cv2.GaussianBlur(truth(FRAME), (0, 0), 4) ** np.float32(0.9) + np.float32(
+        0.05
+    )  # in its own unit
     learned = in_camera_heights(network, *measure(*seen(FRAME, NEIGHBOURS)))
     assert learned is not None
     bounds = refined_label(*seen(FRAME, NEAR), learned)
@@ -121,7 +130,9 @@ def test_more_is_known_than_by_flow_alone_and_it_is_as_right() -> None:
 def test_the_unit_of_learned_depth_may_be_off_in_a_frame() -> None:
     exact, middles = np.maximum(truth(FRAME), np.float32(0.008)), []
     for unit in (0.8, 1.0, 1.25):
-        error, known = errors(refined_label(*seen(FRAME, NEAR), np.float32(unit) * exact), truth(FRAME))
+        error, known = errors(
+            refined_label(*seen(FRAME, NEAR), np.float32(unit) * exact), truth(FRAME)
+        )
         assert known > 0.5
         middles.append(np.median(error))
     assert max(middles) < 0.02
@@ -211,9 +222,14 @@ def test_depth_is_metric_and_its_sigma_tells_where_it_is_known(street, index):
 
 def test_wrong_poses_leave_little_that_seems_known(street):
     turned = np.eye(4)
-    turned[:3, :3] = np.array([[1, 0, 0.0], [0, np.cos(0.02), -np.sin(0.02)], [0, np.sin(0.02), np.cos(0.02)]])
+    turned[:3, :3] = np.array(
+        [[1, 0, 0.0], [0, np.cos(0.02), -np.sin(0.02)], [0, np.sin(0.02), np.cos(0.02)]]
+    )
     neighbours = [120 + k for k in (-4, -2, -1, 1, 2, 4)]
-    (_, right), (_, wrong) = _measured(street, 120, neighbours), _measured(street, 120, neighbours, turned)
+    (_, right), (_, wrong) = (
+        _measured(street, 120, neighbours),
+        _measured(street, 120, neighbours, turned),
+    )
     assert np.isfinite(wrong).mean() < 0.5 * np.isfinite(right).mean()
 
 
@@ -232,7 +248,9 @@ def test_a_flow_made_from_a_depth_gives_that_depth_back():
 
 
 def test_a_lone_outlier_is_left_out_and_one_view_alone_is_not_believed():
-    values = np.array([0.1, 0.101, 0.5, 0.1], np.float32).reshape(4, 1, 1) * np.ones((4, 1, 2), np.float32)
+    values = np.array([0.1, 0.101, 0.5, 0.1], np.float32).reshape(4, 1, 1) * np.ones(
+        (4, 1, 2), np.float32
+    )
     sigmas = np.full((4, 1, 2), 0.002, np.float32)
     sigmas[:3, 0, 1] = np.inf
     inverse_depth, sigma = combine(values, sigmas)

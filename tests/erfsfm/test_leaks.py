@@ -25,7 +25,9 @@ def trained(small: Small, root: Path, output: Path, **data: Any) -> DepthPosePre
         "data": small["data"] | {"roots": [str(root)]} | data,
         "training": small["training"] | {"steps": 1, "batch": 1},
     }
-    return DepthPosePredictor.from_weights(train(ExperimentConfig.model_validate(tree), output, device="cpu"))
+    return DepthPosePredictor.from_weights(
+        train(ExperimentConfig.model_validate(tree), output, device="cpu")
+    )
 
 
 def test_a_raw_drive_leaks_into_its_odometry_sequence(
@@ -35,13 +37,22 @@ def test_a_raw_drive_leaks_into_its_odometry_sequence(
     write_raw(tmp_path / "raw", drive="2011_09_30_drive_0033", speeds=[9] * 6 + [0, 0] + [9] * 5)
     networks = trained(small, tmp_path / "raw", tmp_path / "run", exclude=[])
     record = read_record(tmp_path / "run" / "model.yaml")
-    assert record.trained_on == ["kitti_raw/2011_09_30_drive_0033[0:6]", "kitti_raw/2011_09_30_drive_0033[8:13]"]
+    assert record.trained_on == [
+        "kitti_raw/2011_09_30_drive_0033[0:6]",
+        "kitti_raw/2011_09_30_drive_0033[8:13]",
+    ]
     assert "CC BY-NC-SA" in record.licence
     root = write_root(tmp_path / "odometry", sequences=("09", "10"))
-    with pytest.raises(DataError, match=r"leak: these weights were trained on kitti_odometry/09\[0:8\]"):
+    with pytest.raises(
+        DataError, match=r"leak: these weights were trained on kitti_odometry/09\[0:8\]"
+    ):
         pose_protocol(networks, root, ["09"], "default", allow_leak=False)
-    assert {row["leak"] for row in pose_protocol(networks, root, ["09"], "default", allow_leak=True)} == {True}
-    assert {row["leak"] for row in pose_protocol(networks, root, ["10"], "default", allow_leak=False)} == {False}
+    assert {
+        row["leak"] for row in pose_protocol(networks, root, ["09"], "default", allow_leak=True)
+    } == {True}
+    assert {
+        row["leak"] for row in pose_protocol(networks, root, ["10"], "default", allow_leak=False)
+    } == {False}
 
 
 def test_an_odometry_sequence_leaks_into_the_eigen_list(
@@ -51,5 +62,7 @@ def test_an_odometry_sequence_leaks_into_the_eigen_list(
     networks = trained(small, write_root(tmp_path / "odometry"), tmp_path / "run")
     assert read_record(tmp_path / "run" / "model.yaml").trained_on == ["kitti_odometry/00[0:8]"]
     (tmp_path / "raw").mkdir()
-    with pytest.raises(DataError, match=r"leak: .* kitti_raw/2011_10_03_drive_0027\[0:1\]; choose other weights"):
+    with pytest.raises(
+        DataError, match=r"leak: .* kitti_raw/2011_10_03_drive_0027\[0:1\]; choose other weights"
+    ):
         eigen_protocol(networks, tmp_path / "raw", "eigen", "default", allow_leak=False)

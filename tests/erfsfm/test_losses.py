@@ -66,14 +66,18 @@ def test_dissimilarity_matches_a_naive_reference() -> None:
     result = dissimilarity(first, second)
     for batch in range(2):
         for channel in range(3):
-            expected = naive_dissimilarity(first[batch, channel].numpy(), second[batch, channel].numpy())
+            expected = naive_dissimilarity(
+                first[batch, channel].numpy(), second[batch, channel].numpy()
+            )
             np.testing.assert_allclose(result[batch, channel].numpy(), expected, atol=1e-12)
 
 
 def test_l1_by_hand() -> None:
     target = torch.zeros(1, 3, 4, 5)
     warped = torch.tensor([0.3, 0.6, 0.0]).reshape(1, 3, 1, 1).expand(1, 3, 4, 5)
-    torch.testing.assert_close(photometric_error(target, warped, 0.0), torch.full((1, 1, 4, 5), 0.3))
+    torch.testing.assert_close(
+        photometric_error(target, warped, 0.0), torch.full((1, 1, 4, 5), 0.3)
+    )
 
 
 def test_ssim_of_flat_images_by_hand() -> None:
@@ -129,7 +133,9 @@ def test_edge_aware_by_hand() -> None:
     assert float(edge_aware_smoothness(values, flat)) == pytest.approx(0.5, abs=1e-6)
     edge = flat.clone()
     edge[..., 1:] = 1
-    assert float(edge_aware_smoothness(values, edge)) == pytest.approx((0.5 + 0.5 * math.exp(-1)) / 2, abs=1e-6)
+    assert float(edge_aware_smoothness(values, edge)) == pytest.approx(
+        (0.5 + 0.5 * math.exp(-1)) / 2, abs=1e-6
+    )
 
 
 def bounds(least: float, most: float) -> Bounds:
@@ -144,7 +150,13 @@ HALF = math.log(1.5) / 2  # width of the bounds below
 
 @pytest.mark.parametrize(
     ("ratio", "expected"),
-    [(0, 0.0), (HALF / 2, HALF / 8), (-HALF, HALF / 2), (HALF + 1, 1 + HALF / 2), (-HALF - 1, 1 + HALF / 2)],
+    [
+        (0, 0.0),
+        (HALF / 2, HALF / 8),
+        (-HALF, HALF / 2),
+        (HALF + 1, 1 + HALF / 2),
+        (-HALF - 1, 1 + HALF / 2),
+    ],
     ids=["middle", "in", "least", "near", "far"],
 )
 def test_between_bounds_the_middle_draws_and_beyond_them_the_loss_is_linear(ratio, expected):
@@ -169,8 +181,12 @@ def test_on_a_level_road_every_level_of_the_networks_agrees_with_the_labels(size
         middles = step * torch.arange(height, dtype=torch.float32) + (step - 1) / 2
         shown = enlarged(road(middles)[:, None].expand(1, 1, height, width), level, size)
         assert shown.shape == full.shape
-        inside = slice(step, size[0] - size[0] % step - step)  # at the border there is no row to interpolate to
-        assert torch.allclose(shown[..., inside, :], full[..., inside, :], rtol=1e-5), f"level {level}"
+        inside = slice(
+            step, size[0] - size[0] % step - step
+        )  # at the border there is no row to interpolate to
+        assert torch.allclose(shown[..., inside, :], full[..., inside, :], rtol=1e-5), (
+            f"level {level}"
+        )
 
 
 def test_unbounded_pixels_affect_neither_loss_nor_gradients():
@@ -191,7 +207,11 @@ def test_a_lower_bound_alone_penalises_farther_depth():
     distance = disagreement(disparity, interval, ZERO)
     assert distance.item() == pytest.approx(0.6931, abs=1e-4), "the satisfied pixel does not count"
     distance.backward()
-    assert disparity.grad is not None and disparity.grad[0, 0, 0, 0] < 0 and disparity.grad[0, 0, 0, 1] == 0
+    assert (
+        disparity.grad is not None
+        and disparity.grad[0, 0, 0, 0] < 0
+        and disparity.grad[0, 0, 0, 1] == 0
+    )
 
 
 def test_translation_by_hand_with_one_unmeasured():
@@ -208,7 +228,12 @@ def test_steps_between_pixels_by_hand():
     assert step_disagreement(edge, labels).item() == pytest.approx(0, abs=1e-6)
     assert step_disagreement(5 * edge, labels).item() == pytest.approx(0, abs=1e-6)  # at any scale
     flat = step_disagreement(torch.full_like(edge, 0.14), labels).item()
-    pairs = [(15, 1), (14, 2), (12, 4), (8, 8)]  # columns apart 1, 2, 4 and 8, and those across the edge
+    pairs = [
+        (15, 1),
+        (14, 2),
+        (12, 4),
+        (8, 8),
+    ]  # columns apart 1, 2, 4 and 8, and those across the edge
     expected = sum(crossing / count for count, crossing in pairs) * 0.6931 / 8  # rows have no pairs
     assert flat == pytest.approx(expected, rel=1e-3)
 
@@ -216,7 +241,9 @@ def test_steps_between_pixels_by_hand():
 def test_rotation_disagreement_is_the_chordal_distance_to_measured_rotations():
     angle = 0.3
     turned = torch.eye(3).repeat(1, 2, 1, 1)
-    turned[0, 0, :2, :2] = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    turned[0, 0, :2, :2] = torch.tensor(
+        [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+    )
     measured = torch.eye(3).repeat(1, 2, 1, 1)
     measured[0, 1] = torch.nan
     predicted = turned.clone().requires_grad_()

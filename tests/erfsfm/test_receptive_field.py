@@ -15,7 +15,11 @@ def by_name(names, **options):
 @pytest.mark.slow
 def test_the_papers_dilated_network_follows_ours():
     rows = by_name(["posenet", "erf-posenet-dilated"])
-    assert list(rows) == [("posenet", "default"), ("erf-posenet-dilated", "default"), ("erf-posenet-dilated", "paper")]
+    assert list(rows) == [
+        ("posenet", "default"),
+        ("erf-posenet-dilated", "default"),
+        ("erf-posenet-dilated", "paper"),
+    ]
     paper, ours = rows["erf-posenet-dilated", "paper"], rows["erf-posenet-dilated", "default"]
     assert (paper["theoretical_px"], paper["columns"], paper["rows"]) == (301, 297, 127)
     assert paper["share"] == pytest.approx(0.179, abs=6e-4)
@@ -32,7 +36,8 @@ def test_the_papers_dilated_network_reads_every_second_row_and_column():
 
 
 @pytest.mark.parametrize(
-    "name, side, columns, fraction", [("erf-posenet-dfc", 511, 415, 0.998), ("posenet", 263, 263, 0.632)]
+    "name, side, columns, fraction",
+    [("erf-posenet-dfc", 511, 415, 0.998), ("posenet", 263, 263, 0.632)],
 )
 def test_pushed_taps(name, side, columns, fraction):
     summary = by_name([name])[name, "default"]

@@ -35,14 +35,24 @@ def data(shared: Path, write_root: Callable[..., Path]) -> list[Path]:
     """Tiny drives of every kind that a configuration names."""
     roots = [shared / name for name in ("world", "held_out", "kitti", "folder")]
     if not shared.joinpath("world").exists():
-        write_kitti_root(SimulatedStreet(SimulationOptions("straight", FRAMES, 0, 96, 64)), roots[0], depth=True)
+        write_kitti_root(
+            SimulatedStreet(SimulationOptions("straight", FRAMES, 0, 96, 64)), roots[0], depth=True
+        )
         write_root(roots[1], FRAMES, seed=500)
         write_root(roots[2], FRAMES, SEQUENCES)
         roots[3].mkdir()
         for index in range(FRAMES):
             noise = np.random.default_rng(index).integers(0, 256, (64, 96, 3), np.uint8)
             cv2.imwrite(str(roots[3] / f"{index:06d}.png"), noise)
-        camera = {"width": 96, "height": 64, "fx": 60.0, "fy": 62.0, "cx": 47.0, "cy": 30.0, "fps": 10}
+        camera = {
+            "width": 96,
+            "height": 64,
+            "fx": 60.0,
+            "fy": 62.0,
+            "cx": 47.0,
+            "cy": 30.0,
+            "fps": 10,
+        }
         (roots[3] / "camera.yaml").write_text(yaml.safe_dump(camera))
     return roots
 
@@ -55,15 +65,33 @@ def test_weights_have_the_name_of_the_configuration_that_trains_them() -> None:
 
 
 def test_it_starts(
-    configuration: str, data: list[Path], measure: Callable[..., None], command_line: Callable[..., Any], tmp_path: Path
+    configuration: str,
+    data: list[Path],
+    measure: Callable[..., None],
+    command_line: Callable[..., Any],
+    tmp_path: Path,
 ) -> None:
     written = load_experiment(configuration)
-    small = ["training.batch=2", "training.steps=1", "data.workers=0", "data.validation=[simulated/500]"]
+    small = [
+        "training.batch=2",
+        "training.steps=1",
+        "data.workers=0",
+        "data.validation=[simulated/500]",
+    ]
     small += ["data.validation_share=0", "data.cache_mb=50"]
     small += [f"teacher.cache={tmp_path / 'measured'}"]
     if written.initial_weights in UNTRAINED:  # those fit one size and width
-        small += ["network.height=96", "network.width=160", "network.depth_width=0.0625", "network.pose_width=0.125"]
-        small += [] if written.network.fidelity == "default" else ["network.height=128", "network.width=192"]
+        small += [
+            "network.height=96",
+            "network.width=160",
+            "network.depth_width=0.0625",
+            "network.pose_width=0.125",
+        ]
+        small += (
+            []
+            if written.network.fidelity == "default"
+            else ["network.height=128", "network.width=192"]
+        )
     if "lite0" in written.network.depth:
         small += ["network.depth_width=1"]
     config = load_experiment(configuration, small).with_roots(data)
@@ -86,7 +114,9 @@ FILES = sorted((Path(__file__).parents[2] / "configs" / "erfsfm").glob("table*.y
 
 def test_the_guide_names_them_all() -> None:
     guide = (FILES[0].parents[2] / "docs" / "design" / "reproduction.md").read_text()
-    assert set(re.findall(r"^\| `(table[123]-.+?)`", guide, re.MULTILINE)) == {path.stem for path in FILES}
+    assert set(re.findall(r"^\| `(table[123]-.+?)`", guide, re.MULTILINE)) == {
+        path.stem for path in FILES
+    }
 
 
 def test_the_beginning_of_a_name_lists_all_that_begin_so() -> None:
@@ -98,7 +128,12 @@ def test_the_beginning_of_a_name_lists_all_that_begin_so() -> None:
 def test_a_file_has_the_experiment_of_its_name() -> None:
     for path in FILES:
         experiment = load_experiment(path)
-        network, loss, training, data = experiment.network, experiment.loss, experiment.training, experiment.data
+        network, loss, training, data = (
+            experiment.network,
+            experiment.loss,
+            experiment.training,
+            experiment.data,
+        )
         networks, size = re.fullmatch(r"table[123]-(.*?)-(\d+x\d+)", path.stem).groups()  # type: ignore[union-attr]
         assert f"{network.width}x{network.height}" == size
         presets = networks if "depthnet" in networks else f"depthnet-{networks}"
@@ -133,6 +168,8 @@ def test_defaults_are_the_papers() -> None:
 
 
 def test_overrides() -> None:
-    config = load_experiment("tiny", ["training.steps=7", "data.validation=[]", "loss.reduction=mean"])
+    config = load_experiment(
+        "tiny", ["training.steps=7", "data.validation=[]", "loss.reduction=mean"]
+    )
     assert (config.training.steps, config.data.validation, config.loss.reduction) == (7, [], "mean")
     assert config.network == load_experiment("tiny").network

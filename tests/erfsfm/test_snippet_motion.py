@@ -38,7 +38,9 @@ def sources(T_image_target: Array) -> Array:
     return np.delete(T_image_target, 2, axis=0)
 
 
-def corners(T_image_target: Array, camera: Pinhole, seed: int = 0, noise: float = 0.0) -> list[Followed]:
+def corners(
+    T_image_target: Array, camera: Pinhole, seed: int = 0, noise: float = 0.0
+) -> list[Followed]:
     """What images would show of 200 points at 5 to 60 m."""
     rng = np.random.default_rng(seed)
     f, c = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
@@ -56,8 +58,13 @@ def corners(T_image_target: Array, camera: Pinhole, seed: int = 0, noise: float 
 def errors_deg(T: Array, true: Array) -> tuple[float, float]:
     """Largest error of a rotation, and of the direction of a translation."""
     turns = Rotation.from_matrix(T[:, :3, :3].swapaxes(1, 2) @ true[:, :3, :3]).magnitude()
-    a, b = (each[:, :3, 3] / (np.linalg.norm(each[:, :3, 3], axis=1, keepdims=True) + 1e-12) for each in (T, true))
-    return float(np.degrees(turns).max()), float(np.degrees(np.arccos(np.clip((a * b).sum(axis=1), -1, 1))).max())
+    a, b = (
+        each[:, :3, 3] / (np.linalg.norm(each[:, :3, 3], axis=1, keepdims=True) + 1e-12)
+        for each in (T, true)
+    )
+    return float(np.degrees(turns).max()), float(
+        np.degrees(np.arccos(np.clip((a * b).sum(axis=1), -1, 1))).max()
+    )
 
 
 TURNS = np.array([[0.1, -2.0, 0.1], [0.0, -1.5, 0.2], [0.2, 0.5, 0.0], [0.0, 1.0, -0.2]])
@@ -67,7 +74,9 @@ TURNS = np.array([[0.1, -2.0, 0.1], [0.0, -1.5, 0.2], [0.2, 0.5, 0.0], [0.0, 1.0
 def test_a_wrong_guess_is_mended_for_any_camera(camera: Pinhole) -> None:
     true = steady(TURNS, TRAVEL)
     guess = steady(0.3 * TURNS, TRAVEL + np.array([0.03, 0.02, 0.0]))  # two degrees aside
-    turn, direction = errors_deg(measured(sources(guess), corners(true, camera, noise=0.1), camera), sources(true))
+    turn, direction = errors_deg(
+        measured(sources(guess), corners(true, camera, noise=0.1), camera), sources(true)
+    )
     assert turn < 0.05 and direction < 0.3
 
 
@@ -79,8 +88,13 @@ def test_another_camera_is_another_motion() -> None:
 
 def test_corners_that_move_by_themselves_do_not_count() -> None:
     true, rng = steady(TURNS, TRAVEL), np.random.default_rng(1)
-    steps = [each._replace(after=each.after + 8 * (rng.random((200, 1)) < 0.25)) for each in corners(true, KITTI)]
-    turn, direction = errors_deg(measured(sources(steady(0.5 * TURNS, TRAVEL)), steps, KITTI), sources(true))
+    steps = [
+        each._replace(after=each.after + 8 * (rng.random((200, 1)) < 0.25))
+        for each in corners(true, KITTI)
+    ]
+    turn, direction = errors_deg(
+        measured(sources(steady(0.5 * TURNS, TRAVEL)), steps, KITTI), sources(true)
+    )
     assert turn < 0.05 and direction < 0.3
 
 
@@ -108,12 +122,17 @@ def test_a_camera_that_stands_keeps_the_guessed_direction() -> None:
 def texture(seed: int) -> NDArray[np.uint8]:
     """Smooth noise ``(128, 416)``."""
     coarse = np.random.default_rng(seed).uniform(0, 255, (25, 83))
-    return np.asarray(np.clip(cv2.resize(coarse, (416, 128), interpolation=cv2.INTER_CUBIC), 0, 255), np.uint8)
+    return np.asarray(
+        np.clip(cv2.resize(coarse, (416, 128), interpolation=cv2.INTER_CUBIC), 0, 255), np.uint8
+    )
 
 
 def turned(image: NDArray[np.uint8], R: Array, camera: Pinhole) -> NDArray[np.uint8]:
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    return np.asarray(cv2.warpPerspective(image, K @ R @ np.linalg.inv(K), (416, 128), flags=cv2.INTER_CUBIC), np.uint8)
+    return np.asarray(
+        cv2.warpPerspective(image, K @ R @ np.linalg.inv(K), (416, 128), flags=cv2.INTER_CUBIC),
+        np.uint8,
+    )
 
 
 def seen(turns_deg: Array, camera: Pinhole, seed: int = 0) -> list[NDArray[np.uint8]]:
@@ -138,12 +157,19 @@ def test_blank_images_have_no_corners() -> None:
 
 def test_a_predictor_measures_with_the_camera_of_the_images() -> None:
     config = NetworkConfig(depth_width=0.1, pose_width=0.1, alignment="images")
-    networks = DepthPosePredictor.of(Model(ModelRecord(network=config, trained_on=[]), build_networks(config)))
+    networks = DepthPosePredictor.of(
+        Model(ModelRecord(network=config, trained_on=[]), build_networks(config))
+    )
     images = [np.repeat(each[..., None], 3, axis=2) for each in seen(TURNS, CAMERAS[1])]
     wanted = sources(steady(TURNS, TRAVEL))
     larger = CAMERAS[1].resized(832, 256)  # of the images before they were made smaller
     assert errors_deg(networks.poses(images, CAMERAS[1]), wanted)[0] < 0.1
-    assert errors_deg(networks.poses([networks.prepare(each) for each in images], larger), wanted)[0] < 0.1
+    assert (
+        errors_deg(networks.poses([networks.prepare(each) for each in images], larger), wanted)[0]
+        < 0.1
+    )
     as_kitti = networks.poses(images)
     assert errors_deg(as_kitti, wanted)[0] > 1
-    np.testing.assert_allclose(as_kitti, networks.poses(images, LIKE_KITTI.resized(1241, 376)), atol=1e-9)
+    np.testing.assert_allclose(
+        as_kitti, networks.poses(images, LIKE_KITTI.resized(1241, 376)), atol=1e-9
+    )

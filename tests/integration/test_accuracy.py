@@ -40,7 +40,10 @@ KITTI = (
     Measured("05", "sim", 0.190, 0.302, 0.507),
     Measured("05", "default", 0.297, 0.349, 0.513),
 )
-LOOP = (Measured("loop", "sim", 0.228, 0.257, 0.159), Measured("loop", "default", 0.220, 0.260, 0.125))
+LOOP = (
+    Measured("loop", "sim", 0.228, 0.257, 0.159),
+    Measured("loop", "default", 0.220, 0.260, 0.125),
+)
 LOOPS_CLOSED = 23  # among views of every fourth frame
 
 
@@ -54,10 +57,14 @@ def check(run: RunFolder, measured: Measured) -> None:
 
 
 @pytest.mark.data
-def test_two_seconds_are_as_right_after_the_graph_as_before(data_root: Path, tmp_path: Path) -> None:
+def test_two_seconds_are_as_right_after_the_graph_as_before(
+    data_root: Path, tmp_path: Path
+) -> None:
     options = {"weights": "sim", "frames": "0:20", "overrides": QUICK, "output": tmp_path / "run"}
     found = run_slam(data_root / "kitti_odometry", "02", **options).metrics().tree()["trajectories"]
-    before, after = (found[kind]["align"]["none"]["ate_rmse_m"] for kind in ("odometry", "optimised"))
+    before, after = (
+        found[kind]["align"]["none"]["ate_rmse_m"] for kind in ("odometry", "optimised")
+    )
     assert after < 1.2 * before < 0.3
 
 
@@ -66,7 +73,9 @@ def test_two_seconds_are_as_right_after_the_graph_as_before(data_root: Path, tmp
 @pytest.mark.parametrize("measured", KITTI, ids=str)
 def test_kitti(data_root: Path, tmp_path: Path, measured: Measured) -> None:
     root = data_root / "kitti_odometry"
-    run = run_slam(root, measured.sequence, weights=measured.weights, overrides=QUICK, output=tmp_path / "run")
+    run = run_slam(
+        root, measured.sequence, weights=measured.weights, overrides=QUICK, output=tmp_path / "run"
+    )
     check(run, measured)
 
 

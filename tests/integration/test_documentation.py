@@ -67,7 +67,10 @@ SHORTER: tuple[tuple[str, str], ...] = (
     (r"^(python tools/benchmark.py maps .*)--parts( '[^']+')+", r"\1--parts"),
 )
 
-FAST = ("README.md", "getting-started.md")  # what a new user reads first; the commands of other pages are slow
+FAST = (
+    "README.md",
+    "getting-started.md",
+)  # what a new user reads first; the commands of other pages are slow
 SLOW = (
     r"^erfsfm-slam run(?! --dataset my_drive.mp4 --camera)",  # a whole run each; test_every_command_is_understood
     r"^erfsfm export ",  # tests/erfsfm/test_export.py exports smaller networks
@@ -83,21 +86,42 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
         "it wants hours of labels, and a GPU; tests/erfsfm/data/test_prepared.py has small data",
     ),
     (r"^erfsfm-slam download ", "it downloads; tests/slam/commands/downloads has a server"),
-    (r"^erfsfm-slam calibrate ", "it wants images of a board; tests/slam/commands/calibration renders them"),
-    (r"--truth many-views", "it wants a drive; tests/erfsfm/evaluation/test_protocols.py has a short one"),
+    (
+        r"^erfsfm-slam calibrate ",
+        "it wants images of a board; tests/slam/commands/calibration renders them",
+    ),
+    (
+        r"--truth many-views",
+        "it wants a drive; tests/erfsfm/evaluation/test_protocols.py has a short one",
+    ),
     (r"mapping.voxel_size_m=0.1|make_figures.py ", "it wants frame 80 of KITTI's drive 0013"),
     (r"tools/reproduce.py ", "it trains the paper's networks"),
-    (r"benchmark.py full-size ", "it wants images at the size of KITTI's cameras, and half an hour"),
+    (
+        r"benchmark.py full-size ",
+        "it wants images at the size of KITTI's cameras, and half an hour",
+    ),
     (r"benchmark.py handheld ", "it wants data sets, or minutes a room"),
-    (r"benchmark.py speed ", "it wants another checkout; tests/tools/test_benchmark.py has the parts"),
+    (
+        r"benchmark.py speed ",
+        "it wants another checkout; tests/tools/test_benchmark.py has the parts",
+    ),
     (
         r"train-fusion|runs/fusion|--seed 1[01]00",
         "it wants worlds; tests/erfsfm/training/test_fusion.py has small ones",
     ),
-    (r"^erfsfm-slam live ", "it wants a camera; tests/slam/commands/test_live.py has folders and videos that go on"),
+    (
+        r"^erfsfm-slam live ",
+        "it wants a camera; tests/slam/commands/test_live.py has folders and videos that go on",
+    ),
     (r"^erfsfm-slam batch ", "it starts a cluster; tests/slam/commands/batch does"),
-    (r"--dataset walk ", "it wants a walk of 311 frames; tests/slam/pipeline/test_positioning.py has known distances"),
-    (r"clear640|other640|kitti05", "several drives of 300 frames; tests/slam/commands/localisation has short ones"),
+    (
+        r"--dataset walk ",
+        "it wants a walk of 311 frames; tests/slam/pipeline/test_positioning.py has known distances",
+    ),
+    (
+        r"clear640|other640|kitti05",
+        "several drives of 300 frames; tests/slam/commands/localisation has short ones",
+    ),
     (r"--config own |runs/own", "it wants a drive; tests/integration/test_own_training.py has one"),
 )
 
@@ -141,7 +165,12 @@ def command_lines(block: Block) -> Iterator[Block]:
 def indented(document: Path) -> Iterator[Block]:
     """Lines indented by four blanks, outside of fences, that start with one of our programs."""
     text = document.read_text(encoding="utf-8")
-    text = re.sub(r"^```.*?^```", lambda found: "\n" * found[0].count("\n"), text, flags=re.DOTALL | re.MULTILINE)
+    text = re.sub(
+        r"^```.*?^```",
+        lambda found: "\n" * found[0].count("\n"),
+        text,
+        flags=re.DOTALL | re.MULTILINE,
+    )
     programs = "|".join(map(re.escape, PROGRAMS))
     pattern = rf"^    ((?:[A-Z_]+=\S+ )*(?:{programs}) (?:.*\\\n)*.*)$"
     for found in re.finditer(pattern, text, flags=re.MULTILINE):
@@ -151,7 +180,9 @@ def indented(document: Path) -> Iterator[Block]:
 def commands() -> list[Block]:
     found: list[Block] = []
     for document in DOCUMENTS:
-        for block in [b for b in fenced(document) if b.language in SHELL] + list(indented(document)):
+        for block in [b for b in fenced(document) if b.language in SHELL] + list(
+            indented(document)
+        ):
             found += command_lines(block)
     return found
 
@@ -172,14 +203,22 @@ def shorter(command: str) -> str:
 
 
 def parameter(block: Block) -> Any:
-    is_slow = block.document.name not in FAST or any(re.search(pattern, block.text) for pattern in SLOW)
+    is_slow = block.document.name not in FAST or any(
+        re.search(pattern, block.text) for pattern in SLOW
+    )
     return pytest.param(
-        block, id=f"{block} {block.text.splitlines()[0][:50]}", marks=[pytest.mark.slow] if is_slow else []
+        block,
+        id=f"{block} {block.text.splitlines()[0][:50]}",
+        marks=[pytest.mark.slow] if is_slow else [],
     )
 
 
 # a command that several pages have runs once, where it stands first
-RUNNABLE = [*{block.text: block for block in reversed(commands()) if not reason_not_to_run(block.text)}.values()][::-1]
+RUNNABLE = [
+    *{
+        block.text: block for block in reversed(commands()) if not reason_not_to_run(block.text)
+    }.values()
+][::-1]
 
 
 MAINS: dict[str, Any] = {"erfsfm": erfsfm.cli.main, "erfsfm-slam": slam.commands.cli.main}
@@ -191,10 +230,15 @@ def call(command: str) -> None:
     if program == "python":
         words = [sys.executable, str(ROOT / arguments.pop(0)), *arguments]
         environment = os.environ | {"PYTHONPATH": str(ROOT)}
-        finished = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+        finished = subprocess.run(
+            words, env=environment, capture_output=True, text=True, check=False
+        )
         assert finished.returncode == 0, finished.stdout + finished.stderr
         return
-    with pytest.MonkeyPatch.context() as patch, rc_context():  # evo changes the settings of Matplotlib
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        rc_context(),
+    ):  # evo changes the settings of Matplotlib
         main = MAINS.get(program) or entry_points(group="console_scripts")[program].load()
         patch.setattr(sys, "argv", [program, *arguments])
         try:
@@ -207,7 +251,11 @@ def old_checkpoint(path: Path, preset: str) -> None:
     """A small network under the names of SfMLearner-PyTorch."""
     renamed = {}
     for name, value in build(preset, "paper", 0.25, 4).state_dict().items():
-        name = re.sub(r"encoder\.stages\.(\d)\.(\d)\.0", lambda m: f"conv{int(m[1]) + 1}.{2 * int(m[2])}", name)
+        name = re.sub(
+            r"encoder\.stages\.(\d)\.(\d)\.0",
+            lambda m: f"conv{int(m[1]) + 1}.{2 * int(m[2])}",
+            name,
+        )
         name = re.sub(r"(upconv|iconv)s\.(\d)", lambda m: f"{m[1]}{7 - int(m[2])}", name)
         name = re.sub(r"^heads\.(\d)", lambda m: f"predict_disp{4 - int(m[1])}.0", name)
         renamed[name.replace("pose_head", "pose_pred")] = value
@@ -225,18 +273,29 @@ def relative_network(path: Path) -> None:
         for name, shape in (("image", [1, 3, "height", "width"]), ("depth", None))
     )
     graph = helper.make_graph(
-        nodes, "relative", [image], [depth], [helper.make_tensor("shift", TensorProto.FLOAT, [1], [3.0])]
+        nodes,
+        "relative",
+        [image],
+        [depth],
+        [helper.make_tensor("shift", TensorProto.FLOAT, [1], [3.0])],
     )
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), path)
+    onnx.save(
+        helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), path
+    )
 
 
 def raw_drive(root: Path, sequence: Path) -> None:
     """A KITTI raw drive of the images and scans of a simulated sequence, at 10 m/s."""
     date = root / "2011_09_26"
     drive = date / "2011_09_26_drive_0013_sync"
-    calibration = dict(line.split(":", 1) for line in (sequence / "calib.txt").read_text().splitlines())
+    calibration = dict(
+        line.split(":", 1) for line in (sequence / "calib.txt").read_text().splitlines()
+    )
     T_camera_lidar = np.array(calibration["Tr"].split(), float).reshape(3, 4)
-    for kind, source, suffix in (("image_02", "image_2", "png"), ("velodyne_points", "velodyne", "bin")):
+    for kind, source, suffix in (
+        ("image_02", "image_2", "png"),
+        ("velodyne_points", "velodyne", "bin"),
+    ):
         (drive / kind / "data").mkdir(parents=True)
         for file in sorted((sequence / source).glob(f"*.{suffix}")):
             shutil.copy(file, drive / kind / "data" / f"{int(file.stem):010d}.{suffix}")
@@ -250,7 +309,9 @@ def raw_drive(root: Path, sequence: Path) -> None:
     (date / "calib_cam_to_cam.txt").write_text(
         f"R_rect_00: 1 0 0 0 1 0 0 0 1\nS_rect_02: {WIDTH} {HEIGHT}\nP_rect_02:{calibration['P2']}\n"
     )
-    R, t = (" ".join(map(str, part.ravel())) for part in (T_camera_lidar[:, :3], T_camera_lidar[:, 3]))
+    R, t = (
+        " ".join(map(str, part.ravel())) for part in (T_camera_lidar[:, :3], T_camera_lidar[:, 3])
+    )
     (date / "calib_velo_to_cam.txt").write_text(f"R: {R}\nT: {t}\n")
 
 
@@ -277,7 +338,9 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
             for image in images[:5]:
                 shutil.copy(image, name)
         shutil.copy("world/camera.yaml", "camera.yaml")
-        video = cv2.VideoWriter("my_drive.mp4", cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (WIDTH, HEIGHT))
+        video = cv2.VideoWriter(
+            "my_drive.mp4", cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (WIDTH, HEIGHT)
+        )
         for image in images:
             video.write(cv2.imread(str(image)))
         video.release()
@@ -314,7 +377,9 @@ def whole_workspace(workspace: Path, tmp_path_factory: pytest.TempPathFactory) -
             old_checkpoint(Path(f"{file}.pth.tar"), "posenet")
         old_checkpoint(Path("dispnet_model_best.pth.tar"), "depthnet")
         Path("weights").mkdir()
-        call("erfsfm convert dispnet_model_best.pth.tar exp_pose_model_best.pth.tar --output weights/old")
+        call(
+            "erfsfm convert dispnet_model_best.pth.tar exp_pose_model_best.pth.tar --output weights/old"
+        )
         Path("docs").mkdir()
     return here
 
@@ -325,7 +390,9 @@ def copy_of(folder: Path, copy: Path) -> None:
 
 
 @pytest.fixture
-def at_work(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def at_work(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Path:
     """A copy of the workspace as the current folder, where ``$KITTI_ODOMETRY`` is its ``KITTI``."""
     here = tmp_path / "here"
     is_slow = request.node.get_closest_marker("slow") is not None
@@ -408,7 +475,10 @@ def cells_of_notebook() -> list[Any]:
     nbformat.validate(notebook)
     sources = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
     assert not any(cell.get("outputs") or cell.get("execution_count") for cell in notebook["cells"])
-    return [compile(source, f"{path.name}, code cell {k}", "exec") for k, source in enumerate(sources, 1)]
+    return [
+        compile(source, f"{path.name}, code cell {k}", "exec")
+        for k, source in enumerate(sources, 1)
+    ]
 
 
 @pytest.mark.slow
@@ -420,18 +490,29 @@ def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         exec(cell, names)
     assert names["errors"].ate_rmse_m < 0.8, "0.4 m were measured"
     assert np.isfinite(names["sigmas"]).all() and names["depth_m"].min() > 0
-    written = {path.relative_to("first-steps").as_posix() for path in Path("first-steps").rglob("*")}
-    assert {"map.ply", "model/points3D.txt", "model/images/000119.png", "run/report.html"} <= written
+    written = {
+        path.relative_to("first-steps").as_posix() for path in Path("first-steps").rglob("*")
+    }
+    assert {
+        "map.ply",
+        "model/points3D.txt",
+        "model/images/000119.png",
+        "run/report.html",
+    } <= written
 
 
 def blocks(*languages: str) -> list[Block]:
-    return [block for document in DOCUMENTS for block in fenced(document) if block.language in languages]
+    return [
+        block for document in DOCUMENTS for block in fenced(document) if block.language in languages
+    ]
 
 
 @pytest.mark.parametrize("block", [parameter(block) for block in blocks("python", "py")])
 def test_every_python_block_runs(block: Block, at_work: Path) -> None:
     names = stand_ins(at_work / "world")
-    code = compile("\n" * (block.line - 1) + block.text, str(block.document), "exec")  # a traceback names the line
+    code = compile(
+        "\n" * (block.line - 1) + block.text, str(block.document), "exec"
+    )  # a traceback names the line
     try:
         exec(code, names)
     except Exception as error:
@@ -444,6 +525,9 @@ def test_every_camera_file_opens(block: Block, tmp_path: Path) -> None:
     camera = yaml.safe_load(block.text)
     assert "fx" in camera, f"{block}: this test reads camera.yaml only; add this kind of YAML"
     for k in range(6):
-        cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((camera["height"], camera["width"], 3), 90 + k, np.uint8))
+        cv2.imwrite(
+            str(tmp_path / f"{k}.png"),
+            np.full((camera["height"], camera["width"], 3), 90 + k, np.uint8),
+        )
     (tmp_path / "camera.yaml").write_text(block.text)
     assert len(open_sequence(tmp_path)) == 6

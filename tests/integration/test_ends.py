@@ -42,24 +42,51 @@ class Recording:
     def of(cls, seed: int, most_frames: int = 60) -> Recording:
         """The recording of a seed."""
         rng = np.random.default_rng([seed, 77])
-        size, way = SIZES[rng.choice(6, p=(0.3, 0.3, 0.15, 0.15, 0.05, 0.05))], str(rng.choice(WAYS))
-        fov_deg, fps = float(rng.uniform(40.0, 130.0)), float(np.exp(rng.uniform(0.0, np.log(60.0))))
+        size, way = (
+            SIZES[rng.choice(6, p=(0.3, 0.3, 0.15, 0.15, 0.05, 0.05))],
+            str(rng.choice(WAYS)),
+        )
+        fov_deg, fps = (
+            float(rng.uniform(40.0, 130.0)),
+            float(np.exp(rng.uniform(0.0, np.log(60.0)))),
+        )
         frames, disturbance = int(rng.integers(8, most_frames + 1)), str(rng.choice(DISTURBANCES))
         height_m = float(rng.uniform(0.3, 2.0)) if rng.random() < 0.4 else None
         overrides = [f"mapping.enabled={str(rng.random() < 0.3).lower()}", "output.report=false"]
-        overrides.append(f"keyframes.use={rng.choice(['always', 'auto', 'never'], p=(0.5, 0.4, 0.1))}")
-        return cls(seed, way, size, round(fov_deg, 1), round(fps, 2), frames, disturbance, height_m, tuple(overrides))
+        overrides.append(
+            f"keyframes.use={rng.choice(['always', 'auto', 'never'], p=(0.5, 0.4, 0.1))}"
+        )
+        return cls(
+            seed,
+            way,
+            size,
+            round(fov_deg, 1),
+            round(fps, 2),
+            frames,
+            disturbance,
+            height_m,
+            tuple(overrides),
+        )
 
     def write(self, folder: Path) -> None:
         """A folder of images and their ``camera.yaml``."""
         width, height = self.size
         focal = 0.5 * width / np.tan(0.5 * np.deg2rad(self.fov_deg))
         camera = {"width": width, "height": height, "fx": focal, "fy": focal, "fps": self.fps}
-        camera |= {"cx": 0.5 * (width - 1), "cy": 0.5 * (height - 1), "camera_height_m": self.height_m or "unknown"}
+        camera |= {
+            "cx": 0.5 * (width - 1),
+            "cy": 0.5 * (height - 1),
+            "camera_height_m": self.height_m or "unknown",
+        }
         folder.mkdir()
-        (folder / "camera.yaml").write_text("".join(f"{key}: {value}\n" for key, value in camera.items()))
+        (folder / "camera.yaml").write_text(
+            "".join(f"{key}: {value}\n" for key, value in camera.items())
+        )
         for k, image in enumerate(self.disturbed()):
-            cv2.imwrite(str(folder / f"{k:06d}.png"), cv2.resize(image, self.size, interpolation=cv2.INTER_LINEAR))
+            cv2.imwrite(
+                str(folder / f"{k:06d}.png"),
+                cv2.resize(image, self.size, interpolation=cv2.INTER_LINEAR),
+            )
 
     def disturbed(self) -> list[np.ndarray]:
         """The images, some after the first five black, frozen, of another place or one seen before, noisy or dark."""
@@ -102,13 +129,18 @@ class Recording:
         )
         world = simulated_world(options)
         if self.way not in ("stands", "turns"):
-            return [cv2.cvtColor(world.render(k * stride).image, cv2.COLOR_RGB2BGR) for k in range(self.frames)]
+            return [
+                cv2.cvtColor(world.render(k * stride).image, cv2.COLOR_RGB2BGR)
+                for k in range(self.frames)
+            ]
         still, rng = world.render(0).image[:, :, ::-1], np.random.default_rng([self.seed, 79])
         found = []
         for k in range(self.frames):
             turn = 0.02 * k if self.way == "turns" else 0.0
             R = cv2.Rodrigues(np.array([0.2 * np.sin(turn), turn, 0.0]))[0]
-            seen = cv2.warpPerspective(still, world.K @ R @ np.linalg.inv(world.K), (width, height), borderMode=2)
+            seen = cv2.warpPerspective(
+                still, world.K @ R @ np.linalg.inv(world.K), (width, height), borderMode=2
+            )
             found.append(np.clip(seen + rng.normal(0.0, 2.0, seen.shape), 0, 255).astype(np.uint8))
         return found
 
@@ -131,7 +163,10 @@ def test_a_run_ends(seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setenv(SHOW_TRACEBACK, "1")
     recording = Recording.of(seed)
     recording.write(tmp_path / "images")
-    check(recording, run_slam(tmp_path / "images", output=tmp_path / "run", overrides=recording.overrides))
+    check(
+        recording,
+        run_slam(tmp_path / "images", output=tmp_path / "run", overrides=recording.overrides),
+    )
 
 
 @pytest.mark.slow
@@ -141,4 +176,9 @@ def test_a_stream_ends(seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     recording = Recording.of(seed)
     recording.write(tmp_path / "images")
     options = {"every_frame": True, "wait": 1.0, "overrides": list(recording.overrides)}
-    check(recording, run_live(LiveRequest(dataset=str(tmp_path / "images"), output=tmp_path / "run", **options), print))
+    check(
+        recording,
+        run_live(
+            LiveRequest(dataset=str(tmp_path / "images"), output=tmp_path / "run", **options), print
+        ),
+    )

@@ -19,8 +19,12 @@ TRAJECTORY_ALONE = ("mapping.enabled=false", "output.report=false")
 
 @pytest.mark.data
 @pytest.mark.slow
-def test_forty_frames_of_kitti(data_root: Path, tmp_path: Path, check_run: Callable[[Path], dict[str, Any]]) -> None:
-    run = run_slam(data_root / "kitti_odometry", "00", frames="0:40", output=tmp_path / "run", device="cpu")
+def test_forty_frames_of_kitti(
+    data_root: Path, tmp_path: Path, check_run: Callable[[Path], dict[str, Any]]
+) -> None:
+    run = run_slam(
+        data_root / "kitti_odometry", "00", frames="0:40", output=tmp_path / "run", device="cpu"
+    )
     metrics = check_run(run.path)
     assert (metrics["sequence"]["name"], metrics["sequence"]["frames"]) == ("00", 40)
     assert metrics["scale"]["mode"] == "camera-height"
@@ -33,7 +37,9 @@ def test_forty_frames_of_kitti(data_root: Path, tmp_path: Path, check_run: Calla
 @pytest.mark.data
 def test_a_drive_at_full_size(data_root: Path, tmp_path: Path) -> None:
     root = data_root / "kitti_odometry_original"
-    run = run_slam(root, "00", frames="0:15", output=tmp_path / "run", device="cpu", overrides=TRAJECTORY_ALONE)
+    run = run_slam(
+        root, "00", frames="0:15", output=tmp_path / "run", device="cpu", overrides=TRAJECTORY_ALONE
+    )
     assert run.metrics().tree()["trajectories"]["optimised"]["align"]["6dof"]["ate_rmse_m"] < 0.5
 
 
@@ -41,14 +47,27 @@ def test_a_drive_at_full_size(data_root: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_images_beside_the_map_of_a_kitchen_are_localised(data_root: Path, tmp_path: Path) -> None:
     """Learned depth of a room is wrong by half, so only triangulated points can tell where an image was taken."""
-    images, poses = data_root / "handheld_kitchen" / "images", data_root / "handheld_kitchen" / "poses.kitti.txt"
+    images, poses = (
+        data_root / "handheld_kitchen" / "images",
+        data_root / "handheld_kitchen" / "poses.kitti.txt",
+    )
     overrides = [*TRAJECTORY_ALONE, "scale.mode=reference"]
-    run = run_slam(images, frames="0:300", truth=poses, output=tmp_path / "run", device="cpu", overrides=overrides)
+    run = run_slam(
+        images,
+        frames="0:300",
+        truth=poses,
+        output=tmp_path / "run",
+        device="cpu",
+        overrides=overrides,
+    )
     frames = slice(322, 342, 2)  # 0.2 to 0.4 m from the nearest view
     known = read_trajectory(poses).T_world_camera
     T_world_image = invert(known[0]) @ known[frames]
     found = [each.T_world_camera for each in localise(images, run, frames="322:342", every=2)]
-    errors_m = [np.inf if T is None else np.linalg.norm((T - true)[:3, 3]) for T, true in zip(found, T_world_image)]
+    errors_m = [
+        np.inf if T is None else np.linalg.norm((T - true)[:3, 3])
+        for T, true in zip(found, T_world_image)
+    ]
     assert sum(error_m < 0.15 for error_m in errors_m) >= 9
     street = data_root / "street_depth" / "images"
     assert all(found.T_world_camera is None for found in localise(street, run, Path("fov=70")))
@@ -56,7 +75,9 @@ def test_images_beside_the_map_of_a_kitchen_are_localised(data_root: Path, tmp_p
 
 @pytest.mark.data
 @pytest.mark.slow
-def test_a_road_whose_far_corners_learned_depth_sees_too_near(data_root: Path, tmp_path: Path) -> None:
+def test_a_road_whose_far_corners_learned_depth_sees_too_near(
+    data_root: Path, tmp_path: Path
+) -> None:
     """Most corners are far there: with one length for all distances the near ones were outliers, and ATE was 3.2 m."""
     root = data_root / "failures" / "kitti03_full"
     run = run_slam(root, "03", output=tmp_path / "run", device="cpu", overrides=TRAJECTORY_ALONE)

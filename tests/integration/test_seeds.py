@@ -27,4 +27,7 @@ def test_seeds_on_the_simulated_street(tmp_path: Path) -> None:
     one, two = (each.trajectory("optimised").positions for each in (first, other))
     assert 0 < np.linalg.norm(one - two, axis=1).max() < 2 * ATE_M
     for each in (first, other):
-        assert each.metrics().tree()["trajectories"]["optimised"]["align"]["7dof"]["ate_rmse_m"] < 2 * ATE_M
+        assert (
+            each.metrics().tree()["trajectories"]["optimised"]["align"]["7dof"]["ate_rmse_m"]
+            < 2 * ATE_M
+        )

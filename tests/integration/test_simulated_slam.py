@@ -31,7 +31,11 @@ from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
 
 FACTOR = 0.2  # unscaled lengths per metre
-NOISE = {"rotation_sigma": np.deg2rad(0.3), "translation_relative_sigma": 0.05, "depth_relative_sigma": 0.03}
+NOISE = {
+    "rotation_sigma": np.deg2rad(0.3),
+    "translation_relative_sigma": 0.05,
+    "depth_relative_sigma": 0.03,
+}
 
 
 class Rendered(SimulatedSequence):
@@ -58,7 +62,9 @@ def street() -> Rendered:
 
 def drive(sequence: Rendered, seed: int, *overrides: str) -> Estimate:
     assert sequence.reference is not None
-    oracle = OraclePredictor(sequence.reference, sequence.depth, OracleNoise(**NOISE, seed=seed), FACTOR)
+    oracle = OraclePredictor(
+        sequence.reference, sequence.depth, OracleNoise(**NOISE, seed=seed), FACTOR
+    )
     return SlamPipeline(sequence, oracle, load_config(None, overrides)).run()
 
 
@@ -77,7 +83,9 @@ def test_image_geometry_and_graph_reduce_the_error_of_the_network(round_trip: Es
     assert len(round_trip.optimised) == 250
     sources = [motion.relative_pose.source for motion in round_trip.drive.motions]
     assert sources.count(ESSENTIAL_SOURCE) > 200
-    assert ate(round_trip.network, round_trip) == pytest.approx(0.94, rel=0.2)  # chained from snippets that touch
+    assert ate(round_trip.network, round_trip) == pytest.approx(
+        0.94, rel=0.2
+    )  # chained from snippets that touch
     assert ate(round_trip.odometry, round_trip) < 2 * 0.64
     assert ate(round_trip.optimised, round_trip) < 2 * 0.109
 
@@ -134,22 +142,32 @@ def test_rotations_of_the_shipped_networks_follow_the_road(
 ) -> None:
     metrics = check_run(learned)
     assert metrics["provenance"]["leak"] is False
-    network, truth = steps(learned / "trajectory_network.kitti.txt"), steps(learned / "reference.kitti.txt")
+    network, truth = (
+        steps(learned / "trajectory_network.kitti.txt"),
+        steps(learned / "reference.kitti.txt"),
+    )
     right = [np.arctan2(T_step[:, 0, 2], T_step[:, 2, 2]) for T_step in (network, truth)]
     assert np.corrcoef(right)[0, 1] > 0.7
     assert (network[:, 2, 3] > 0).mean() > 0.95  # forward
 
 
 @pytest.mark.slow
-def test_the_system_is_better_than_its_networks(learned: Path, check_run: Callable[[Path], dict[str, Any]]) -> None:
+def test_the_system_is_better_than_its_networks(
+    learned: Path, check_run: Callable[[Path], dict[str, Any]]
+) -> None:
     metrics = check_run(learned)
-    errors = {name: metrics["trajectories"][name]["align"] for name in ("network", "odometry", "optimised")}
+    errors = {
+        name: metrics["trajectories"][name]["align"]
+        for name in ("network", "odometry", "optimised")
+    }
     assert errors["network"]["7dof"]["ate_rmse_m"] < 2 * 0.738
     assert errors["odometry"]["7dof"]["ate_rmse_m"] < 2 * 0.117
     assert errors["optimised"]["7dof"]["ate_rmse_m"] < 2 * 0.108
     assert errors["optimised"]["6dof"]["ate_rmse_m"] < 2 * 0.367
     assert metrics["scale"]["mode"] == "camera-height"
-    assert (metrics["map"]["triangles"] or 0) > 1000 and metrics["map"]["accuracy_median_m"] < 2 * 0.153
+    assert (metrics["map"]["triangles"] or 0) > 1000 and metrics["map"][
+        "accuracy_median_m"
+    ] < 2 * 0.153
 
 
 @pytest.mark.slow

@@ -37,10 +37,20 @@ socket.socket.connect = connect_on_this_machine
 
 def call(*command: object, folder: Path, **environment: str) -> str:
     """Standard output of a command that must succeed, in a folder outside the tree."""
-    own = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "KITTI_ODOMETRY")}
+    own = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ("PYTHONPATH", "KITTI_ODOMETRY")
+    }
     words = [str(word) for word in command]
     finished = subprocess.run(
-        words, cwd=folder, env=own | environment, capture_output=True, text=True, check=False, timeout=300
+        words,
+        cwd=folder,
+        env=own | environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
     )
     assert finished.returncode == 0, f"{' '.join(words)}\n{finished.stdout}\n{finished.stderr}"
     return finished.stdout
@@ -97,12 +107,20 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
 def test_the_wheel_holds_the_packages_whole(installed: Installed) -> None:
     names = set(zipfile.ZipFile(installed.wheel).namelist())
     for package in SHIPPED:
-        files = {path for path in (ROOT / package).rglob("*") if path.is_file() and "__pycache__" not in path.parts}
+        files = {
+            path
+            for path in (ROOT / package).rglob("*")
+            if path.is_file() and "__pycache__" not in path.parts
+        }
         assert {str(path.relative_to(ROOT)) for path in files} <= names
     assert {name.split("/")[0] for name in names if ".dist-info/" not in name} == set(SHIPPED)
     for file in (ROOT / "configs").rglob("*.yaml"):
         package, *rest = file.relative_to(ROOT / "configs").parts
-        parts = ("erfsfm", "_configs", "splits", *rest) if package == "splits" else (package, "_configs", *rest)
+        parts = (
+            ("erfsfm", "_configs", "splits", *rest)
+            if package == "splits"
+            else (package, "_configs", *rest)
+        )
         assert "/".join(parts) in names
 
 
@@ -110,24 +128,45 @@ def test_an_index_takes_both(installed: Installed) -> None:
     assert not twine.commands.check.check([str(installed.sdist), str(installed.wheel)], strict=True)
     with tarfile.open(installed.sdist) as archive:
         names = {Path(*Path(name).parts[1:]).as_posix() for name in archive.getnames()}
-    assert {"Makefile", "constraints.txt", "requirements.lock", "tests/conftest.py", "CONTRIBUTING.md"} <= names
+    assert {
+        "Makefile",
+        "constraints.txt",
+        "requirements.lock",
+        "tests/conftest.py",
+        "CONTRIBUTING.md",
+    } <= names
 
 
 def test_the_programs_are_those_of_the_wheel(installed: Installed, tmp_path: Path) -> None:
-    where = installed.run(tmp_path, "python", "-c", "import erfsfm, slam; print(erfsfm.__file__, slam.__file__)")
+    where = installed.run(
+        tmp_path, "python", "-c", "import erfsfm, slam; print(erfsfm.__file__, slam.__file__)"
+    )
     assert all(Path(file).is_relative_to(installed.environment) for file in where.split())
 
 
-def test_it_runs(installed: Installed, tmp_path: Path, check_run: Callable[[Path], dict[str, Any]]) -> None:
+def test_it_runs(
+    installed: Installed, tmp_path: Path, check_run: Callable[[Path], dict[str, Any]]
+) -> None:
     installed.run(tmp_path, "erfsfm-slam", "run", "--frames", "0:40")
     metrics = check_run(tmp_path / "results" / "latest")
     assert metrics["sequence"]["frames"] == 40 and metrics["map"]["triangles"] > 1000
 
 
 def test_it_trains_by_name(installed: Installed, tmp_path: Path) -> None:
-    assert {row["name"] for row in json.loads(installed.run(tmp_path, "erfsfm", "networks", "--json"))} >= {"depthnet"}
+    assert {
+        row["name"] for row in json.loads(installed.run(tmp_path, "erfsfm", "networks", "--json"))
+    } >= {"depthnet"}
     size = ("--route", "straight", "--frames", 12, "--width", 208, "--height", 64)
     installed.run(tmp_path, "erfsfm-slam", "simulate", "world", *size)
-    options = ("--config", "tiny", "--set", "training.steps=2", "--dataset", "world", "--output", "toy")
+    options = (
+        "--config",
+        "tiny",
+        "--set",
+        "training.steps=2",
+        "--dataset",
+        "world",
+        "--output",
+        "toy",
+    )
     installed.run(tmp_path, "erfsfm", "train", *options)
     assert (tmp_path / "toy" / "model.yaml").is_file()

@@ -52,7 +52,13 @@ def alignment(ate: float, scale: float) -> dict[str, Any]:
 
 def errors_of(ate: float) -> dict[str, Any]:
     return {
-        "snippet5": {"ate_mean": 0.0123, "ate_std": 0.006, "re_mean": 0.0021, "re_std": 0.001, "count": 296},
+        "snippet5": {
+            "ate_mean": 0.0123,
+            "ate_std": 0.006,
+            "re_mean": 0.0021,
+            "re_std": 0.001,
+            "count": 296,
+        },
         "align": {
             "none": alignment(9.0 * ate, 1.0),
             "first": alignment(9.0 * ate, 1.0),
@@ -60,7 +66,12 @@ def errors_of(ate: float) -> dict[str, Any]:
             "6dof": alignment(3.0 * ate, 1.0),
             "7dof": alignment(ate, 1.12),
         },
-        "evo": {"ape_rmse_m_7dof": ate, "rpe_trans_m": 0.0213, "rpe_rot_deg": 0.0571, "difference": 3.1e-12},
+        "evo": {
+            "ape_rmse_m_7dof": ate,
+            "rpe_trans_m": 0.0213,
+            "rpe_rot_deg": 0.0571,
+            "difference": 3.1e-12,
+        },
     }
 
 
@@ -72,16 +83,23 @@ def map_errors(median_m: float) -> dict[str, Any]:
     return {**sizes, **missing, "f_score": at, "precision": at, "recall": at}
 
 
-def metrics_of(leak: bool = False, mode: str = "camera-height", reference: bool = True) -> dict[str, Any]:
+def metrics_of(
+    leak: bool = False, mode: str = "camera-height", reference: bool = True
+) -> dict[str, Any]:
     """``metrics.json`` as in section 7 of the design."""
     truth, unit = "the sequence has no true poses", "camera heights" if mode == "none" else "metres"
     unknown = {"snippet5": None, "snippet5_reason": truth, "align": None, "align_reason": truth}
     unknown |= {"evo": None, "evo_reason": truth}
     numbers = {"network": 6.21, "odometry": 2.43, "optimised": 0.87}
-    trajectories: dict[str, Any] = {k: errors_of(v) if reference else unknown for k, v in numbers.items()}
+    trajectories: dict[str, Any] = {
+        k: errors_of(v) if reference else unknown for k, v in numbers.items()
+    }
     if reference:
         for alignment in trajectories["odometry"]["align"].values():
-            alignment |= {"t_rel_percent": None, "t_rel_percent_reason": "no segment of 100 m was left"}
+            alignment |= {
+                "t_rel_percent": None,
+                "t_rel_percent_reason": "no segment of 100 m was left",
+            }
     trajectories |= {"lidar": None, "lidar_reason": "the sequence has no LiDAR scans"}
     return {
         "schema": 1,
@@ -102,13 +120,25 @@ def metrics_of(leak: bool = False, mode: str = "camera-height", reference: bool 
         },
         "sequence": {"name": "sim/loop <42>", "frames": 300, "length_m": 299.0, "fps": 10.0}
         if reference
-        else {"name": "video", "frames": 300, "length_m": None, "length_m_reason": truth, "fps": 10.0},
+        else {
+            "name": "video",
+            "frames": 300,
+            "length_m": None,
+            "length_m_reason": truth,
+            "fps": 10.0,
+        },
         "timing": {
             "seconds_total": 61.3,
             "frames_per_second": 4.9,
             "cpu_seconds": 118.2,
             "peak_rss_mb": 1432.1,
-            "stages": {"read": 3.1, "depth network": 24.0, "pose network": 11.2, "geometry": 9.8, "map": 11.9},
+            "stages": {
+                "read": 3.1,
+                "depth network": 24.0,
+                "pose network": 11.2,
+                "geometry": 9.8,
+                "map": 11.9,
+            },
         },
         "scale": {"mode": mode, "unit": unit, "value": 1.0 if mode == "none" else 1.6503},
         "trajectories": trajectories,
@@ -130,7 +160,10 @@ def metrics_of(leak: bool = False, mode: str = "camera-height", reference: bool 
             "truth": "lidar",
             "evaluated_m": 59.9,
             "with_scale": {"scale": 1.006, **map_errors(0.079)},
-            "by_distance": [{"from_m": 5.0 * k, "to_m": 5.0 * k + 5.0, **map_errors(0.05 * (k + 1))} for k in range(5)],
+            "by_distance": [
+                {"from_m": 5.0 * k, "to_m": 5.0 * k + 5.0, **map_errors(0.05 * (k + 1))}
+                for k in range(5)
+            ],
         },
     }
 
@@ -139,7 +172,9 @@ def metrics_of(leak: bool = False, mode: str = "camera-height", reference: bool 
 def make_run(tmp_path: Path) -> MakeRun:
     """Builds a run folder; ``metrics`` replaces the numbers, ``reference`` writes the truth."""
 
-    def make(name: str = "run", metrics: dict[str, Any] | None = None, reference: bool = True) -> RunFolder:
+    def make(
+        name: str = "run", metrics: dict[str, Any] | None = None, reference: bool = True
+    ) -> RunFolder:
         folder = RunFolder.create(tmp_path / name, tmp_path, "sim")
         stamps = 0.1 * np.arange(300)
         for each, (step_m, yaw_bias) in GEOMETRY.items():
@@ -152,7 +187,9 @@ def make_run(tmp_path: Path) -> MakeRun:
         folder.write("config.yaml", "scale:\n  mode: auto\n")
         folder.write("loops.json", '{"accepted": [{"from": 295, "to": 2}], "rejected": []}\n')
         folder.write_metrics(
-            Metrics.model_validate(metrics if metrics is not None else metrics_of(reference=reference))
+            Metrics.model_validate(
+                metrics if metrics is not None else metrics_of(reference=reference)
+            )
         )
         return folder
 
@@ -184,7 +221,9 @@ def copy_of_kitti_root(kitti_root: Path, tmp_path: Path) -> Callable[[], Path]:
 def write_weights() -> Callable[..., Path]:
     """Writes small networks with random weights, as a training run would."""
 
-    def write(folder: Path, trained_on: tuple[str, ...] = ("simulated/17",), sources: int = 4) -> Path:
+    def write(
+        folder: Path, trained_on: tuple[str, ...] = ("simulated/17",), sources: int = 4
+    ) -> Path:
         import torch
 
         from erfsfm.checkpoint import Model, build_networks, save_model
@@ -192,8 +231,12 @@ def write_weights() -> Callable[..., Path]:
         from erfsfm.model_record import ModelRecord
 
         torch.manual_seed(0)
-        network = NetworkConfig(depth_width=0.1, pose_width=0.125, height=64, width=208, sources=sources)
-        record = ModelRecord(network=network, trained_on=list(trained_on), licence="none, untrained")
+        network = NetworkConfig(
+            depth_width=0.1, pose_width=0.125, height=64, width=208, sources=sources
+        )
+        record = ModelRecord(
+            network=network, trained_on=list(trained_on), licence="none, untrained"
+        )
         save_model(folder, Model(record, build_networks(network)))
         return folder
 
@@ -201,7 +244,9 @@ def write_weights() -> Callable[..., Path]:
 
 
 @pytest.fixture(scope="session")
-def tiny_weights(tmp_path_factory: pytest.TempPathFactory, write_weights: Callable[..., Path]) -> Path:
+def tiny_weights(
+    tmp_path_factory: pytest.TempPathFactory, write_weights: Callable[..., Path]
+) -> Path:
     """Small untrained networks."""
     return write_weights(tmp_path_factory.mktemp("weights"))
 

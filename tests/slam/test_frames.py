@@ -41,7 +41,10 @@ def test_what_is_derived_from_a_frame_is_kept_by_its_key() -> None:
         "layers 1",
     ]
     assert made == ["layers 1", "layers 2"]
-    assert Frame(0, 0.0, image()).derived(("layers", 1), lambda: "of another frame") == "of another frame"
+    assert (
+        Frame(0, 0.0, image()).derived(("layers", 1), lambda: "of another frame")
+        == "of another frame"
+    )
 
 
 def test_a_relative_pose_in_another_unit_has_other_lengths_only() -> None:

@@ -21,14 +21,21 @@ from slam.geometry.se3 import from_rotation_vector, invert
 from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics, ScaleMetrics
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))  # as ``python tools/benchmark.py`` finds its modules
+sys.path.insert(
+    0, str(Path(__file__).parents[2] / "tools")
+)  # as ``python tools/benchmark.py`` finds its modules
 benchmark = importlib.import_module("benchmark")
-columns, page, runs = (importlib.import_module(f"benchmarking.{name}") for name in ("metrics", "page", "runs"))
+columns, page, runs = (
+    importlib.import_module(f"benchmarking.{name}") for name in ("metrics", "page", "runs")
+)
 
 
 def metrics(ate: float = 1.0, seconds: float = 20.0, **stages: float) -> Metrics:
     """The metrics of a run that the tables read."""
-    alignments = {how: {"ate_rmse_m": ate, "scale": 1.1, "r_rel_deg_per_100m": 0.5} for how in ("6dof", "7dof")}
+    alignments = {
+        how: {"ate_rmse_m": ate, "scale": 1.1, "r_rel_deg_per_100m": 0.5}
+        for how in ("6dof", "7dof")
+    }
     tree = {
         "status": "ok",
         "provenance": {"leak": False},
@@ -41,7 +48,9 @@ def metrics(ate: float = 1.0, seconds: float = 20.0, **stages: float) -> Metrics
             "stages": stages,
         },
         "scale": {"mode": "camera-height", "unit": "metres", "value": 1.0},
-        "trajectories": {name: {"align": alignments} for name in ("network", "odometry", "optimised")},
+        "trajectories": {
+            name: {"align": alignments} for name in ("network", "odometry", "optimised")
+        },
         "graph": {"coverage": {"95": 0.9}},
         "loops": {"accepted": 3},
         "map": {"triangles": None, "triangles_reason": "no map"},
@@ -80,19 +89,31 @@ def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(job: Any)
     assert "Failed: loop 610, sim, everything on, seed 2: out of memory" in text
 
 
-@pytest.mark.parametrize(("moved_m", "turned_deg", "false"), [(1.9, 4.9, 0), (2.1, 0.0, 1), (0.0, 5.1, 1)])
-def test_true_and_false_loops(tmp_path: Path, moved_m: float, turned_deg: float, false: int) -> None:
+@pytest.mark.parametrize(
+    ("moved_m", "turned_deg", "false"), [(1.9, 4.9, 0), (2.1, 0.0, 1), (0.0, 5.1, 1)]
+)
+def test_true_and_false_loops(
+    tmp_path: Path, moved_m: float, turned_deg: float, false: int
+) -> None:
     T_world_camera = np.tile(np.eye(4), (3, 1, 1))
     T_world_camera[:, :3, 3] = [[0, 0, 0], [4, 0, 0], [4, 0, 7]]
     T_world_camera[2, :3, :3] = Rotation.from_euler("y", 90, degrees=True).as_matrix()
     off = from_rotation_vector(np.deg2rad([0.0, turned_deg, 0.0]), np.array([moved_m, 0.0, 0.0]))
-    loops = [{"from": 1, "to": 2, "T_from_to": (invert(T_world_camera[1]) @ T_world_camera[2] @ off).tolist()}]
+    loops = [
+        {
+            "from": 1,
+            "to": 2,
+            "T_from_to": (invert(T_world_camera[1]) @ T_world_camera[2] @ off).tolist(),
+        }
+    ]
     RunFolder(tmp_path).write_metrics(metrics())
     (tmp_path / "loops.json").write_text(json.dumps({"accepted": loops}))
     RunFolder(tmp_path).write_trajectory("reference", Trajectory(np.arange(3.0), T_world_camera))
     assert runs.loops(tmp_path) == (1 - false, false)
     runs.loops.cache_clear()
-    in_heights = metrics().changed(scale=ScaleMetrics(mode="none", unit="camera heights", value=1.0))
+    in_heights = metrics().changed(
+        scale=ScaleMetrics(mode="none", unit="camera heights", value=1.0)
+    )
     RunFolder(tmp_path).write_metrics(in_heights)
     assert runs.loops(tmp_path) == (None, None)
 
@@ -105,7 +126,9 @@ def test_two_checkouts_in_turn(tmp_path: Path) -> None:
     text = report.read_text()
     table = cells(text)
     head, row = table[0], table[1]
-    before, after = (float(part.split(":")[0]) for part in row[head.index("CPU ms / frame")].split(","))
+    before, after = (
+        float(part.split(":")[0]) for part in row[head.index("CPU ms / frame")].split(",")
+    )
     assert row[0] == "grid 610, 12 frames" and before > 0 and after > 0
     assert "geometry" in table[2] and str(tmp_path) not in text
 
@@ -113,7 +136,15 @@ def test_two_checkouts_in_turn(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_one_real_run_and_one_that_fails(tmp_path: Path) -> None:
     words = ["accuracy", "--routes", "straight", "--worlds", "610", "--frames", "8", "--seeds", "0"]
-    words += ["--weights", "sim", "nonesuch", "--set", "mapping.enabled=false", "--output", str(tmp_path / "out")]
+    words += [
+        "--weights",
+        "sim",
+        "nonesuch",
+        "--set",
+        "mapping.enabled=false",
+        "--output",
+        str(tmp_path / "out"),
+    ]
     report = tmp_path / "page.md"
     benchmark.main([*words, "--report", str(report)])
     with (tmp_path / "out" / "accuracy.csv").open() as file:

@@ -10,7 +10,9 @@ TOOLS = Path(__file__).parents[2] / "tools"
 
 
 @pytest.mark.parametrize("tool", sorted(TOOLS.glob("*.py")), ids=lambda p: p.name)
-def test_help_shows_an_example(tool: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_shows_an_example(
+    tool: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.syspath_prepend(str(TOOLS))
     monkeypatch.setattr(sys, "argv", [str(tool), "--help"])
     with pytest.raises(SystemExit) as ended:
@@ -21,7 +23,9 @@ def test_help_shows_an_example(tool: Path, monkeypatch: pytest.MonkeyPatch, caps
 
 def test_the_page_of_settings_is_current(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(TOOLS))
-    monkeypatch.setattr(sys, "argv", ["settings_page.py", "--output", str(tmp_path / "settings.md")])
+    monkeypatch.setattr(
+        sys, "argv", ["settings_page.py", "--output", str(tmp_path / "settings.md")]
+    )
     runpy.run_path(str(TOOLS / "settings_page.py"), run_name="__main__")
     written = (tmp_path / "settings.md").read_text(encoding="utf-8")
     assert written == (TOOLS.parent / "docs/settings.md").read_text(encoding="utf-8"), (

@@ -14,7 +14,11 @@ from erfsfm.common.table import DASH, Table
 
 Label = Callable[[JobResult], str]
 Cell = Callable[[Sequence[JobResult]], str]
-drive, kind, weights = attrgetter("job.drive.name"), attrgetter("job.drive.kind"), attrgetter("job.weights")
+drive, kind, weights = (
+    attrgetter("job.drive.name"),
+    attrgetter("job.drive.kind"),
+    attrgetter("job.weights"),
+)
 configuration = attrgetter("job.configuration")
 
 
@@ -31,7 +35,9 @@ class MetricDefinition:
 
     def value(self, o: JobResult) -> float | None:
         """The number; None where it is not known."""
-        found: float | None = o.metrics.at(self.source)[0] if isinstance(self.source, str) else self.source(o)
+        found: float | None = (
+            o.metrics.at(self.source)[0] if isinstance(self.source, str) else self.source(o)
+        )
         return found
 
 
@@ -55,12 +61,16 @@ def stage_seconds(o: JobResult, stage: str) -> float | None:
 FRAMES = MetricDefinition("frames", "sequence.frames")
 LENGTH = MetricDefinition("path (m)", "sequence.length_m")
 ERRORS = tuple(
-    MetricDefinition(f"ATE {dof}-dof, {trajectory}", f"trajectories.{trajectory}.align.{dof}dof.ate_rmse_m", 2)
+    MetricDefinition(
+        f"ATE {dof}-dof, {trajectory}", f"trajectories.{trajectory}.align.{dof}dof.ate_rmse_m", 2
+    )
     for dof in "76"
     for trajectory in ("network", "odometry", "optimised")
 )
 ATE_7, ATE_6 = ERRORS[2], ERRORS[5]
-R_REL = MetricDefinition("r_rel (deg / 100 m)", "trajectories.optimised.align.7dof.r_rel_deg_per_100m", 2)
+R_REL = MetricDefinition(
+    "r_rel (deg / 100 m)", "trajectories.optimised.align.7dof.r_rel_deg_per_100m", 2
+)
 SCALE = MetricDefinition("scale", "trajectories.optimised.align.7dof.scale", 3)
 PERCENT = share("7-dof, % of path", ATE_7, LENGTH, 100.0)
 PERCENT_6 = share("6-dof, % of path", ATE_6, LENGTH, 100.0)
@@ -95,12 +105,24 @@ MEMORY = MetricDefinition("peak RSS (MiB)", "timing.peak_rss_mb")
 SECONDS = MetricDefinition("seconds", "timing.seconds_total", 1)
 TIME = share("ms / frame", SECONDS, FRAMES, 1e3, 1)
 CPU = share("CPU ms / frame", MetricDefinition("CPU s", "timing.cpu_seconds", 1), FRAMES, 1e3, 1)
-DEFINITIONS = (FRAMES, LENGTH, *ERRORS, PERCENT, PERCENT_6, NETWORK_PERCENT, OF_NETWORK, R_REL, SCALE)
+DEFINITIONS = (
+    FRAMES,
+    LENGTH,
+    *ERRORS,
+    PERCENT,
+    PERCENT_6,
+    NETWORK_PERCENT,
+    OF_NETWORK,
+    R_REL,
+    SCALE,
+)
 DEFINITIONS += (LOOPS, TRUE_LOOPS, FALSE_LOOPS, COVERAGE, *MAP_ERRORS, *MAP_SIZES, FUSION, MESH)
 DEFINITIONS += (RATE, MEMORY, SECONDS, TIME, CPU)
 
 
-def rows(results: Sequence[JobResult], definitions: Sequence[MetricDefinition] = ()) -> list[dict[str, Any]]:
+def rows(
+    results: Sequence[JobResult], definitions: Sequence[MetricDefinition] = ()
+) -> list[dict[str, Any]]:
     """One row a run for the CSV: what ran, what came out, also by more ``definitions``, seconds by stage."""
     commit = revision()
     return [
@@ -125,7 +147,9 @@ def stages(results: Sequence[JobResult]) -> list[str]:
     return list(dict.fromkeys(stage for o in results for stage in o.metrics.timing.stages or ()))
 
 
-def table(rows: Mapping[str, Label], columns: Mapping[str, Cell], results: Sequence[JobResult]) -> str:
+def table(
+    rows: Mapping[str, Label], columns: Mapping[str, Cell], results: Sequence[JobResult]
+) -> str:
     """Markdown: one row for each group of results that share their labels."""
     groups = grouped(results, *rows.values()).items()
     cells = [[*label, *(cell(group) for cell in columns.values())] for label, group in groups]
@@ -146,17 +170,23 @@ def over_seeds(definition: MetricDefinition) -> Cell:
     def cell(group: Sequence[JobResult]) -> str:
         found = values(group, definition)
         deviation = round(stdev(found), definition.decimals) if len(found) > 1 else 0.0
-        return mean(found, definition.decimals) + (f" ± {deviation:.{definition.decimals}f}" if deviation else "")
+        return mean(found, definition.decimals) + (
+            f" ± {deviation:.{definition.decimals}f}" if deviation else ""
+        )
 
     return cell
 
 
-def middle_and_extreme(definition: MetricDefinition, extreme: Callable[[Sequence[float]], float]) -> Cell:
+def middle_and_extreme(
+    definition: MetricDefinition, extreme: Callable[[Sequence[float]], float]
+) -> Cell:
     """Median and the largest or smallest value of a group."""
     return lambda group: spread(values(group, definition), definition.decimals, extreme)
 
 
-def spread(found: Sequence[float], decimals: int, extreme: Callable[[Sequence[float]], float]) -> str:
+def spread(
+    found: Sequence[float], decimals: int, extreme: Callable[[Sequence[float]], float]
+) -> str:
     """Median and the largest or smallest of some numbers."""
     return f"{median(found):.{decimals}f} ({extreme(found):.{decimals}f})" if found else DASH
 

@@ -12,7 +12,17 @@ from pathlib import Path
 import numpy as np
 from benchmarking import handheld
 from benchmarking import metrics as m
-from benchmarking.metrics import Cell, MetricDefinition, drive, grouped, kind, over_seeds, table, values, weights
+from benchmarking.metrics import (
+    Cell,
+    MetricDefinition,
+    drive,
+    grouped,
+    kind,
+    over_seeds,
+    table,
+    values,
+    weights,
+)
 from benchmarking.runs import EVERYTHING, FALSE_DEG, FALSE_M, JobResult, revision
 from make_figures import draw_trajectories, trajectories_of
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -46,7 +56,16 @@ _COUNTS: dict[str, Cell] = {
 
 def error_tables(results: Sequence[JobResult]) -> str:
     """One row for each kind of drive, then one for each sequence and weights."""
-    definitions = (m.FRAMES, m.LENGTH, *m.ERRORS, m.PERCENT, m.PERCENT_6, m.OF_NETWORK, m.R_REL, m.SCALE)
+    definitions = (
+        m.FRAMES,
+        m.LENGTH,
+        *m.ERRORS,
+        m.PERCENT,
+        m.PERCENT_6,
+        m.OF_NETWORK,
+        m.R_REL,
+        m.SCALE,
+    )
     definitions += (m.LOOPS, m.FALSE_LOOPS, m.COVERAGE, m.RATE, m.MEMORY)
     columns = {q.title: over_seeds(q) for q in definitions}
     return f"""Every kind of drive: median and, in brackets, the worst run. ATE is that of the optimised
@@ -64,7 +83,9 @@ def maps_tables(results: Sequence[JobResult]) -> str:
     rows = {"sequence": drive, "weights": weights, "configuration": m.configuration}
     whole = [o for o in results if o.job.configuration == EVERYTHING]
     costs = (*m.MAP_SIZES, m.FUSION, m.MESH, m.MEMORY)
-    sizes = table({"sequence": drive, "weights": weights}, {q.title: over_seeds(q) for q in costs}, whole)
+    sizes = table(
+        {"sequence": drive, "weights": weights}, {q.title: over_seeds(q) for q in costs}, whole
+    )
     return f"""Errors of the map after one rigid motion, by the best truth of each drive
 ([metrics](metrics.md#error-of-the-map)). *Double walls* is the share of the mesh's area with a parallel surface 0.3 to
 2 m before it.
@@ -95,9 +116,13 @@ def handheld_summary(results: Sequence[JobResult]) -> str:
     """One row for each kind of recording and weights."""
     columns: dict[str, Cell] = {
         **_COUNTS,
-        "mean ATE 7-dof (m)": lambda group: m.mean(values(group, handheld.ATE), handheld.ATE.decimals),
+        "mean ATE 7-dof (m)": lambda group: m.mean(
+            values(group, handheld.ATE), handheld.ATE.decimals
+        ),
         "ATE 7-dof, % of path: median (worst)": m.middle_and_extreme(handheld.PERCENT, max),
-        "losses in all": lambda group: f"{sum(lost):.0f}" if (lost := values(group, handheld.LOSSES)) else DASH,
+        "losses in all": lambda group: (
+            f"{sum(lost):.0f}" if (lost := values(group, handheld.LOSSES)) else DASH
+        ),
         "frames before the first map": m.middle_and_extreme(handheld.FIRST_MAP, max),
         "before a new map": m.middle_and_extreme(handheld.NEW_MAP, max),
         "share of frames located": m.middle_and_extreme(handheld.LOCATED, min),
@@ -124,7 +149,9 @@ def notes(results: Sequence[JobResult], definitions: Iterable[MetricDefinition])
     lines: dict[str, None] = {}
     for o in (o for o in results if not o.reason):
         if o.metrics.provenance.leak is True:
-            lines[f"LEAK: weights {o.job.weights} saw frames of {o.job.drive.name} in training."] = None
+            lines[
+                f"LEAK: weights {o.job.weights} saw frames of {o.job.drive.name} in training."
+            ] = None
         for definition in definitions:
             if definition.value(o) is None:
                 lines[f"{DASH} {definition.title}, {o.job.drive.name}: not known."] = None
@@ -136,7 +163,11 @@ def section(mode: str, command: str, results: Sequence[JobResult], at_a_time: st
     """A section of the page: command, commit and seeds, then its tables."""
     seeds = ", ".join(dict.fromkeys(str(o.job.seed) for o in results))
     failed = sum(bool(o.reason) for o in results)
-    picture = f"\n\n![every drive from above]({PICTURE})" if mode == "accuracy" and drawable(results) else ""
+    picture = (
+        f"\n\n![every drive from above]({PICTURE})"
+        if mode == "accuracy" and drawable(results)
+        else ""
+    )
     return f"""## {mode.capitalize()}
 
     {command}
@@ -166,7 +197,15 @@ def with_section(page: str, new: str) -> str:
     sections = {text.splitlines()[0]: text.strip() + "\n" for text in [*old, new]}
     order = [f"## {mode.capitalize()}" for mode in (*TABLES, "speed")]
     place = {title: number for number, title in enumerate(order)}
-    return "\n".join([PAGE, *(sections[title] for title in sorted(sections, key=lambda t: place.get(t, len(order))))])
+    return "\n".join(
+        [
+            PAGE,
+            *(
+                sections[title]
+                for title in sorted(sections, key=lambda t: place.get(t, len(order)))
+            ),
+        ]
+    )
 
 
 def summary_table(results: Sequence[JobResult]) -> str:
@@ -178,7 +217,9 @@ def summary_table(results: Sequence[JobResult]) -> str:
         "the network's": m.middle_and_extreme(m.NETWORK_PERCENT, max),
         "over the network's": m.middle_and_extreme(m.OF_NETWORK, max),
         "over the clean drive's": against_clean(results),
-        "drives with a true loop": lambda group: f"{sum(n > 0 for n in values(group, m.TRUE_LOOPS))} of {len(group)}",
+        "drives with a true loop": lambda group: (
+            f"{sum(n > 0 for n in values(group, m.TRUE_LOOPS))} of {len(group)}"
+        ),
         "false loops": lambda group: f"{sum(values(group, m.FALSE_LOOPS)):.0f}",
         "frames / s": m.middle_and_extreme(m.RATE, min),
         "CPU ms / frame": m.middle_and_extreme(m.CPU, max),
@@ -196,9 +237,15 @@ def against_clean(results: Sequence[JobResult]) -> Cell:
     by_run = {key(o.job.drive.name, o): o for o in results}
 
     def cell(group: Sequence[JobResult]) -> str:
-        twins = [(o, by_run[key(o.job.drive.clean, o)]) for o in group if key(o.job.drive.clean, o) in by_run]
+        twins = [
+            (o, by_run[key(o.job.drive.clean, o)])
+            for o in group
+            if key(o.job.drive.clean, o) in by_run
+        ]
         pairs = [(values([o], m.ATE_7), values([twin], m.ATE_7)) for o, twin in twins]
-        return m.spread([ate / clean for [ate], [clean] in (p for p in pairs if all(p)) if clean > 0], 2, max)
+        return m.spread(
+            [ate / clean for [ate], [clean] in (p for p in pairs if all(p)) if clean > 0], 2, max
+        )
 
     return cell
 
@@ -213,7 +260,9 @@ def draw(results: Sequence[JobResult], path: Path) -> None:
     chosen = drawable(results)
     columns = math.ceil(math.sqrt(1.6 * len(chosen)))
     rows = math.ceil(len(chosen) / columns)
-    figure = Figure(figsize=(columns * SIDE_IN, rows * SIDE_IN + 0.5), dpi=DPI, layout="constrained")
+    figure = Figure(
+        figsize=(columns * SIDE_IN, rows * SIDE_IN + 0.5), dpi=DPI, layout="constrained"
+    )
     panels = figure.subfigures(rows, columns, squeeze=False).flat
     for o, panel in zip(chosen, panels):
         axes = draw_trajectories(panel, trajectories_of(RunFolder.open(o.job.place)), "")
@@ -224,7 +273,9 @@ def draw(results: Sequence[JobResult], path: Path) -> None:
         axes.set_title(drive(o), fontsize=8)
         axes.tick_params(labelsize=6)
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=min(columns, len(labels)), fontsize=9)
+    figure.legend(
+        handles, labels, loc="outside upper center", ncols=min(columns, len(labels)), fontsize=9
+    )
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     light = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).quantize(COLOURS)

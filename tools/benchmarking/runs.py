@@ -124,7 +124,9 @@ def plan(
     """Every combination, configuration by configuration."""
     return [
         Job(folder, drive, each, name, (*overrides, *changes), seed, device)
-        for (name, overrides), seed, each, drive in product(configurations.items(), seeds, weights, drives)
+        for (name, overrides), seed, each, drive in product(
+            configurations.items(), seeds, weights, drives
+        )
     ]
 
 
@@ -153,18 +155,25 @@ def simulated(
     root = folder / slug(" ".join([*words, f"v{VERSION}"]))
     if not hazards:
         return BenchmarkSequence(name, root, simulate=words, kind=kind)
-    return BenchmarkSequence(f"{name}, {condition}", root, simulate=words, kind=f"{kind}, {condition}", clean=name)
+    return BenchmarkSequence(
+        f"{name}, {condition}", root, simulate=words, kind=f"{kind}, {condition}", clean=name
+    )
 
 
 def recordings(kitti: Path, names: Sequence[str], frames: str | None) -> list[BenchmarkSequence]:
     """The sequences of a KITTI odometry root, all of them or those named."""
     chosen = names or list(sequence_kinds(kitti))
-    return [BenchmarkSequence(f"KITTI {name}", kitti, name, frames, kind="KITTI") for name in chosen]
+    return [
+        BenchmarkSequence(f"KITTI {name}", kitti, name, frames, kind="KITTI") for name in chosen
+    ]
 
 
 def raw_drives(folders: Sequence[Path]) -> list[BenchmarkSequence]:
     """KITTI raw drives, each a folder of its own."""
-    return [BenchmarkSequence(folder.name, folder.resolve(), sequence="", kind="KITTI raw") for folder in folders]
+    return [
+        BenchmarkSequence(folder.name, folder.resolve(), sequence="", kind="KITTI raw")
+        for folder in folders
+    ]
 
 
 def measured(jobs: Sequence[Job], count: int, scheduler: str | None) -> list[JobResult]:
@@ -201,7 +210,9 @@ def revision(checkout: Path = ROOT) -> str:
         return "unknown"
 
     def git(*words: str) -> str:
-        return subprocess.run(["git", "-C", str(checkout), *words], capture_output=True, text=True, check=True).stdout
+        return subprocess.run(
+            ["git", "-C", str(checkout), *words], capture_output=True, text=True, check=True
+        ).stdout
 
     changed = git("status", "--porcelain", "--", *SOURCES)
     return git("rev-parse", "--short=12", "HEAD").strip() + ("-dirty" if changed else "")
@@ -217,7 +228,8 @@ def loops(folder: Path) -> tuple[int | None, int | None]:
         return None, None
     accepted = LoopsFile.read(folder / LOOPS).accepted or []
     false = sum(
-        is_false(np.array(loop.T_from_to), *reference.T_world_camera[[loop.from_, loop.to]]) for loop in accepted
+        is_false(np.array(loop.T_from_to), *reference.T_world_camera[[loop.from_, loop.to]])
+        for loop in accepted
     )
     return len(accepted) - false, false
 
@@ -239,7 +251,9 @@ Costs = dict[str, dict[str, Cost]]  # medians by drive and checkout
 COLUMNS = ("CPU ms / frame", "ms / frame", "peak RSS (MiB)")  # before the stages, ms a frame each
 
 
-def in_turn(checkouts: Mapping[str, Path], drives: Mapping[str, Sequence[str]], pairs: int, output: Path) -> Costs:
+def in_turn(
+    checkouts: Mapping[str, Path], drives: Mapping[str, Sequence[str]], pairs: int, output: Path
+) -> Costs:
     """The costs of each drive, arguments of ``erfsfm-slam run``, by each of two checkouts; every run is a new one.
 
     Raises:
@@ -251,7 +265,10 @@ def in_turn(checkouts: Mapping[str, Path], drives: Mapping[str, Sequence[str]], 
         for pair in range(pairs):
             for column, (commit, checkout) in enumerate(checkouts.items()):
                 runs[commit].append(_cost(checkout, arguments, output / f"{row}-{pair}-{column}"))
-                print(f"{drive}, {commit}: {runs[commit][-1][COLUMNS[0]]:.1f} ms a frame", file=sys.stderr)
+                print(
+                    f"{drive}, {commit}: {runs[commit][-1][COLUMNS[0]]:.1f} ms a frame",
+                    file=sys.stderr,
+                )
         costs[drive] = {
             commit: {key: median(each.get(key, 0.0) for each in found) for key in found[0]}
             for commit, found in runs.items()
@@ -262,13 +279,18 @@ def in_turn(checkouts: Mapping[str, Path], drives: Mapping[str, Sequence[str]], 
 def tables(costs: Costs) -> str:
     """Costs and their ratios, then the stages, in Markdown."""
     before, after = next(iter(costs.values()))
-    stages = list(dict.fromkeys(key for pair in costs.values() for cost in pair.values() for key in cost))
+    stages = list(
+        dict.fromkeys(key for pair in costs.values() for cost in pair.values() for key in cost)
+    )
     stages = stages[len(COLUMNS) :]
     rows, by_stage = [], []
     for drive, pair in costs.items():
         both = [[cost[key] for cost in pair.values()] for key in COLUMNS]
         rows.append([drive, *(f"{old:.0f}, {new:.0f}: **{new / old:.2f}**" for old, new in both)])
-        by_stage += [[drive, c, *(f"{cost.get(stage, 0.0):.1f}" for stage in stages)] for c, cost in pair.items()]
+        by_stage += [
+            [drive, c, *(f"{cost.get(stage, 0.0):.1f}" for stage in stages)]
+            for c, cost in pair.items()
+        ]
     return f"""Medians of {before}, of {after}: and their ratio.
 
 {Table(["drive", *COLUMNS], rows).markdown()}
@@ -286,5 +308,11 @@ def _cost(checkout: Path, arguments: Sequence[str], output: Path) -> Cost:
         raise SystemExit(f"{' '.join(arguments)} by {checkout} failed: {reason}; see {log}")
     tree = json.loads((output / METRICS).read_text(encoding="utf-8"))
     timing, ms = tree["timing"], 1e3 / tree["sequence"]["frames"]
-    measured = (ms * timing["cpu_seconds"], 1e3 / timing["frames_per_second"], timing["peak_rss_mb"])
-    return dict(zip(COLUMNS, measured)) | {stage: ms * seconds for stage, seconds in timing["stages"].items()}
+    measured = (
+        ms * timing["cpu_seconds"],
+        1e3 / timing["frames_per_second"],
+        timing["peak_rss_mb"],
+    )
+    return dict(zip(COLUMNS, measured)) | {
+        stage: ms * seconds for stage, seconds in timing["stages"].items()
+    }

@@ -30,7 +30,9 @@ class LiveMap:
         chosen = []
         for frame, cloud in sorted(clouds.items()):
             last = max(self.clouds, default=None)
-            if last is None or has_moved(T_map_camera[frame], T_map_camera[last], self.spacing, _TURN_DEG):
+            if last is None or has_moved(
+                T_map_camera[frame], T_map_camera[last], self.spacing, _TURN_DEG
+            ):
                 self.clouds[frame] = cloud[cloud[:, 2] <= self.depth_to]
                 chosen.append(frame)
         return chosen
@@ -45,7 +47,9 @@ class LiveMap:
         thinned: FloatArray = points[np.sort(first)]
         return thinned
 
-    def grid(self, T_map_camera: FloatArray, camera_height: float, metre: float) -> tuple[NDArray[np.int8], Grid]:
+    def grid(
+        self, T_map_camera: FloatArray, camera_height: float, metre: float
+    ) -> tuple[NDArray[np.int8], Grid]:
         """Occupancy in percent ``(H, W)``, smallest y first: the share of keyframes that see something stand there.
 
         Args:
@@ -57,7 +61,10 @@ class LiveMap:
             RunError: no ground below the cameras, or too many cells.
         """
         points = self.points(T_map_camera)
-        ground, grid = ground_along(points, T_map_camera, camera_height), Grid.around(points, self.resolution)
+        ground, grid = (
+            ground_along(points, T_map_camera, camera_height),
+            Grid.around(points, self.resolution),
+        )
         seen, occupied = np.zeros(grid.width * grid.height), np.zeros(grid.width * grid.height)
         for frame, cloud in self.clouds.items():
             X = apply(T_map_camera[frame], cloud)

@@ -24,7 +24,10 @@ def parameters() -> dict[str, float | str]:
 def generate_launch_description() -> LaunchDescription:
     """The node in the Python of this shell."""
     defaults = parameters()
-    arguments = [DeclareLaunchArgument(name, default_value=str(value)) for name, value in (TOPICS | defaults).items()]
+    arguments = [
+        DeclareLaunchArgument(name, default_value=str(value))
+        for name, value in (TOPICS | defaults).items()
+    ]
     command: list[object] = ["python3", str(NODE), "--ros-args"]
     for name in TOPICS:
         command += ["-r", [name, ":=", LaunchConfiguration(name)]]

@@ -9,7 +9,15 @@ from typing import Any
 
 import numpy as np
 import rclpy
-from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Transform, TransformStamped, Vector3
+from geometry_msgs.msg import (
+    Point,
+    Pose,
+    PoseStamped,
+    Quaternion,
+    Transform,
+    TransformStamped,
+    Vector3,
+)
 from live_map import USUAL_CAMERA_HEIGHT_M, LiveMap
 from nav_msgs.msg import MapMetaData, OccupancyGrid, Path
 from rcl_interfaces.msg import ParameterDescriptor
@@ -32,7 +40,9 @@ from slam.runtime.errors import SlamError
 from slam.sequences.bag import camera_file_of, image_of, is_rectified
 from slam.sequences.camera_file import DEFAULT_FPS, Undistortion, undistorted
 
-T_MAP_WORLD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # without a base
+T_MAP_WORLD = np.array(
+    [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
+)  # without a base
 STRIDE = 2  # pixels of the kept depth
 PARAMETERS: dict[str, Any] = {
     "weights": "default",
@@ -64,14 +74,19 @@ class SlamNode(Node):  # type: ignore[misc,unused-ignore]
         super().__init__("erfsfm_slam")
         any_type = ParameterDescriptor(dynamic_typing=True)  # 1 for 1.0
         self._of: dict[str, Any] = {
-            name: type(v)(self.declare_parameter(name, v, any_type).value) for name, v in PARAMETERS.items()
+            name: type(v)(self.declare_parameter(name, v, any_type).value)
+            for name, v in PARAMETERS.items()
         }
         self._slam: Slam | None = None
         self._undistortion: Undistortion | None = None
-        self._map = LiveMap(self._of["resolution"], self._of["keyframe_spacing"], self._of["depth_to"])
+        self._map = LiveMap(
+            self._of["resolution"], self._of["keyframe_spacing"], self._of["depth_to"]
+        )
         self._T_base_camera: FloatArray | None = None
         self._T_odom_base: list[FloatArray] = []
-        kept = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)  # for those who come later
+        kept = QoSProfile(
+            depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
+        )  # for those who come later
         self._pose = self.create_publisher(PoseStamped, "pose", 10)
         self._path = self.create_publisher(Path, "path", 1)
         self._keyframe = self.create_publisher(PointCloud2, "keyframe_points", 10)
@@ -79,7 +94,9 @@ class SlamNode(Node):  # type: ignore[misc,unused-ignore]
         self._grid = self.create_publisher(OccupancyGrid, "map", kept)
         self._tf, self._known_tf = TransformBroadcaster(self), Buffer()
         self._listener = TransformListener(self._known_tf, self)
-        newest = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.BEST_EFFORT)  # others are dropped
+        newest = QoSProfile(
+            depth=1, reliability=QoSReliabilityPolicy.BEST_EFFORT
+        )  # others are dropped
         self.create_subscription(CameraInfo, "camera_info", self.begin, newest)
         self.create_subscription(Image, "image", self.add, newest)
         self.create_service(Trigger, "close_loops", self.close_loops)
@@ -92,18 +109,26 @@ class SlamNode(Node):  # type: ignore[misc,unused-ignore]
             intrinsics, self._undistortion = undistorted(camera)
             config = load_config(None, self._of["settings"].split())
             height_m = self._of["camera_height_m"] or None
-            self._slam = Slam.from_weights(self._of["weights"], intrinsics, config, height_m, with_map=True)
+            self._slam = Slam.from_weights(
+                self._of["weights"], intrinsics, config, height_m, with_map=True
+            )
 
     def add(self, message: Image) -> None:
         """Measure an image and say where it was taken; one that cannot be used is left out and logged."""
         if self._slam is None or not self._knows_base(message.header):
-            lacking = "camera_info" if self._slam is None else f"transform from {self._of['base_frame']} to the camera"
+            lacking = (
+                "camera_info"
+                if self._slam is None
+                else f"transform from {self._of['base_frame']} to the camera"
+            )
             self._say(f"no {lacking} yet: images are left out")
             return
         stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
         try:
             image = image_of(message, f"the image at {stamp:.3f} s")
-            self._slam.add_frame(self._undistortion.apply(image) if self._undistortion else image, stamp)
+            self._slam.add_frame(
+                self._undistortion.apply(image) if self._undistortion else image, stamp
+            )
             self._publish(message.header)
             if self._is_due("loops_every"):
                 self._solve()
@@ -139,7 +164,9 @@ class SlamNode(Node):  # type: ignore[misc,unused-ignore]
             self._T_base_camera = np.eye(4)
         if self._T_base_camera is None:
             with suppress(TransformException):
-                found = self._known_tf.lookup_transform(self._of["base_frame"], image.frame_id, Time())
+                found = self._known_tf.lookup_transform(
+                    self._of["base_frame"], image.frame_id, Time()
+                )
                 self._T_base_camera = matrix_of(found.transform)
         return self._T_base_camera is not None
 
@@ -169,7 +196,10 @@ class SlamNode(Node):  # type: ignore[misc,unused-ignore]
         if self._is_due("pose_every"):
             self._pose.publish(PoseStamped(header=header, pose=pose_of(T_map_camera[-1])))
         if self._is_due("path_every"):
-            stamps = (Time(nanoseconds=round(1e9 * stamp)).to_msg() for stamp in self._slam.trajectory().stamps)
+            stamps = (
+                Time(nanoseconds=round(1e9 * stamp)).to_msg()
+                for stamp in self._slam.trajectory().stamps
+            )
             headers = [Header(stamp=stamp, frame_id=header.frame_id) for stamp in stamps]
             poses = [PoseStamped(header=h, pose=pose_of(T)) for h, T in zip(headers, T_map_camera)]
             self._path.publish(Path(header=header, poses=poses))
@@ -187,13 +217,17 @@ class SlamNode(Node):  # type: ignore[misc,unused-ignore]
         base = self._of["base_frame"] or camera
         if self._of["publish_tf"] == "map_to_odom":
             try:
-                found = self._known_tf.lookup_transform(self._of["odom_frame"], base, Time.from_msg(header.stamp))
+                found = self._known_tf.lookup_transform(
+                    self._of["odom_frame"], base, Time.from_msg(header.stamp)
+                )
             except TransformException as error:
                 self._say(f"no {self._of['odom_frame']} at the time of the image: {error}")
                 return
             T_odom_base = matrix_of(found.transform)
         else:
-            while len(self._T_odom_base) <= newest:  # images without a pose of their own are bridged later
+            while (
+                len(self._T_odom_base) <= newest
+            ):  # images without a pose of their own are bridged later
                 k = len(self._T_odom_base)
                 step = invert(T_map_base[k - 1]) @ T_map_base[k] if k else T_map_base[0]
                 self._T_odom_base.append(self._T_odom_base[-1] @ step if k else step)
@@ -214,7 +248,9 @@ class SlamNode(Node):  # type: ignore[misc,unused-ignore]
         height_m = self._of["camera_height_m"]
         metre = 1.0 if self._slam.unit_name == "m" else 1.0 / USUAL_CAMERA_HEIGHT_M
         try:
-            cells, grid = self._map.grid(T_map_camera, metre * (height_m or USUAL_CAMERA_HEIGHT_M), metre)
+            cells, grid = self._map.grid(
+                T_map_camera, metre * (height_m or USUAL_CAMERA_HEIGHT_M), metre
+            )
         except SlamError as error:
             self._say(str(error))
             return
@@ -222,14 +258,17 @@ class SlamNode(Node):  # type: ignore[misc,unused-ignore]
         T_map_corner[:2, 3] = grid.corner
         size = {"resolution": grid.resolution, "width": grid.width, "height": grid.height}
         info = MapMetaData(map_load_time=header.stamp, origin=pose_of(T_map_corner), **size)
-        self._grid.publish(OccupancyGrid(header=header, info=info, data=array("b", cells.tobytes())))
+        self._grid.publish(
+            OccupancyGrid(header=header, info=info, data=array("b", cells.tobytes()))
+        )
 
 
 def pose_of(T: FloatArray) -> Pose:
     """The message of a pose."""
     xyzw = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True).tolist()
     return Pose(
-        position=Point(**dict(zip("xyz", T[:3, 3].tolist()))), orientation=Quaternion(**dict(zip("xyzw", xyzw)))
+        position=Point(**dict(zip("xyz", T[:3, 3].tolist()))),
+        orientation=Quaternion(**dict(zip("xyzw", xyzw))),
     )
 
 
@@ -251,15 +290,23 @@ def matrix_of(transform: Transform) -> FloatArray:
 
 def points_of(points: FloatArray, header: Header) -> PointCloud2:
     """The message of points ``(P, 3)``."""
-    fields = [PointField(name=name, offset=4 * k, datatype=PointField.FLOAT32, count=1) for k, name in enumerate("xyz")]
+    fields = [
+        PointField(name=name, offset=4 * k, datatype=PointField.FLOAT32, count=1)
+        for k, name in enumerate("xyz")
+    ]
     data = array("B", points.astype(np.float32).tobytes())
     size = {"height": 1, "width": len(points), "point_step": 12, "row_step": 12 * len(points)}
-    return PointCloud2(header=header, fields=fields, is_bigendian=False, is_dense=True, data=data, **size)
+    return PointCloud2(
+        header=header, fields=fields, is_bigendian=False, is_dense=True, data=data, **size
+    )
 
 
 if __name__ == "__main__":
     rclpy.init()
-    node, executor = SlamNode(), MultiThreadedExecutor(2)  # transforms arrive while an image is measured
+    node, executor = (
+        SlamNode(),
+        MultiThreadedExecutor(2),
+    )  # transforms arrive while an image is measured
     executor.add_node(node)
     with suppress(KeyboardInterrupt, ExternalShutdownException):
         executor.spin()

@@ -11,7 +11,9 @@ from erfsfm.common.errors import OneLineError
 
 def parser_of(doc: str | None) -> argparse.ArgumentParser:
     """A parser whose help begins with the docstring of a tool."""
-    return argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    return argparse.ArgumentParser(
+        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
 
 
 @contextmanager

@@ -43,18 +43,26 @@ class CameraFile(BaseModel):
         description="opencv: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1..s4 [tx ty]]]]; fisheye: k1 k2 k3 k4; fov: the angle",
     )
     readout_ms: float = Field(
-        default=0.0, ge=0, description="time from the first row of an image to the last, milliseconds (rolling shutter)"
+        default=0.0,
+        ge=0,
+        description="time from the first row of an image to the last, milliseconds (rolling shutter)",
     )
-    depth_per_metre: float | None = Field(default=None, gt=0, description="value of one metre in the maps of depth/")
+    depth_per_metre: float | None = Field(
+        default=None, gt=0, description="value of one metre in the maps of depth/"
+    )
     source: str | None = Field(default=None, description="a note on where the numbers come from")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         height_m = self.camera_height_m
         if not isinstance(height_m, str | None) and not 0 < height_m <= HIGHEST_M:
-            raise ValueError(f"camera_height_m: must be greater than 0, to {HIGHEST_M:g}, or 'unknown', is {height_m}")
+            raise ValueError(
+                f"camera_height_m: must be greater than 0, to {HIGHEST_M:g}, or 'unknown', is {height_m}"
+            )
         if self.readout_ms > 1e3 / self.fps:
-            raise ValueError(f"readout_ms: at most {1e3 / self.fps:g}, the time of a frame; is {self.readout_ms:g}")
+            raise ValueError(
+                f"readout_ms: at most {1e3 / self.fps:g}, the time of a frame; is {self.readout_ms:g}"
+            )
         problem = impossible(self.pinhole)
         if problem is not None:
             raise ValueError(problem)
@@ -63,9 +71,13 @@ class CameraFile(BaseModel):
             raise ValueError("distortion: needs model opencv, fisheye or fov; a pinhole has none")
         if allowed is not None and len(self.distortion) not in allowed:
             counts = " or ".join(map(str, allowed))
-            raise ValueError(f"distortion: model {self.model} has {counts} numbers, not {len(self.distortion)}")
+            raise ValueError(
+                f"distortion: model {self.model} has {counts} numbers, not {len(self.distortion)}"
+            )
         if self.model == "fov" and not 0 < self.distortion[0] < math.pi:
-            raise ValueError(f"distortion: the angle of model fov lies between 0 and pi, is {self.distortion[0]:g}")
+            raise ValueError(
+                f"distortion: the angle of model fov lies between 0 and pi, is {self.distortion[0]:g}"
+            )
         return self
 
     @property
@@ -95,7 +107,9 @@ def read_camera_file(path: Path, own: Mapping[str, Any] | None = None) -> Camera
     except ErfsfmError as error:
         raise DataError(str(error)) from error
     if not isinstance(content, dict):
-        keys = ", ".join(name for name, item in CameraFile.model_fields.items() if item.is_required())
+        keys = ", ".join(
+            name for name, item in CameraFile.model_fields.items() if item.is_required()
+        )
         raise DataError(f"{path} holds no keys: a camera file needs {keys}")
     return camera_of({**(own or {}), **content}, str(path))
 
@@ -114,7 +128,9 @@ def camera_of(keys: dict[str, Any], where: str) -> CameraFile:
     height_m = camera.height_or(None)
     if height_m is not None and not _USUAL_HEIGHTS_M[0] <= height_m <= _USUAL_HEIGHTS_M[1]:
         logger.warning(
-            "%s: camera_height_m is %g: check that it is the height above the road in metres", where, height_m
+            "%s: camera_height_m is %g: check that it is the height above the road in metres",
+            where,
+            height_m,
         )
     return camera
 
@@ -124,7 +140,9 @@ FOCAL_RATIO_LIMITS = (0.1, 20.0)
 # pixels: OpenCV resamples no longer sides; 64 million are more than the sensors of cameras have
 _SIDE_LIMITS = (8, 32766)
 MOST_PIXELS = 2**26
-_CENTRE_TOLERANCE = 0.2  # of the image's size; the principal points of the KITTI cameras are within 0.05
+_CENTRE_TOLERANCE = (
+    0.2  # of the image's size; the principal points of the KITTI cameras are within 0.05
+)
 _PIXEL_ASPECT_TOLERANCE = 0.1  # pixels of PAL video are 1.09 times as wide as they are high
 
 
@@ -196,4 +214,6 @@ def require_plausible(camera: Pinhole, where: str) -> None:
     if abs(camera.fx / camera.fy - 1) > _PIXEL_ASPECT_TOLERANCE:
         doubts.append(f"fx : fy is {camera.fx / camera.fy:.2f}, so pixels are not square")
     if doubts:
-        logger.warning("%s: %s; check that the calibration belongs to these images", where, "; ".join(doubts))
+        logger.warning(
+            "%s: %s; check that the calibration belongs to these images", where, "; ".join(doubts)
+        )

@@ -17,7 +17,9 @@ from erfsfm.common.readers.kitti import ODOMETRY_DRIVES
 EVERYTHING = 10**9
 KINDS = ("folder", "kitti_odometry", "kitti_raw", "simulated")
 _RANGED = re.compile(r"(?P<base>.+)\[(?P<start>\d*):(?P<stop>\d*)\]", re.DOTALL)
-_PLAIN = re.compile(r"[^\[\]]+|(?!kitti_|simulated/)\w+/.+", re.DOTALL)  # users name their own folders as they like
+_PLAIN = re.compile(
+    r"[^\[\]]+|(?!kitti_|simulated/)\w+/.+", re.DOTALL
+)  # users name their own folders as they like
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,9 @@ class FrameRange:
         match = _RANGED.fullmatch(name)
         if match is None:
             if not _PLAIN.fullmatch(name):
-                raise ConfigError(f"'{name}' names no frames: write kind/recording or kind/recording[start:stop]")
+                raise ConfigError(
+                    f"'{name}' names no frames: write kind/recording or kind/recording[start:stop]"
+                )
             return FrameRange(name.removesuffix("_sync"), 0, EVERYTHING)
         start = int(match["start"] or 0)
         stop = int(match["stop"] or EVERYTHING)

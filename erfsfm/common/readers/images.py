@@ -25,15 +25,27 @@ Image = NDArray[np.uint8]
 T = TypeVar("T")
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
-IMAGE_FOLDERS = ("images", "image_2", "image_02", "image_0", "image_00", "rgb", "data")  # never a name of a drive
+IMAGE_FOLDERS = (
+    "images",
+    "image_2",
+    "image_02",
+    "image_0",
+    "image_00",
+    "rgb",
+    "data",
+)  # never a name of a drive
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-_JPEG_SEGMENT = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]", re.DOTALL)  # begins one with a length, or is the end
+_JPEG_SEGMENT = re.compile(
+    rb"\xff[^\x00\x01\xd0-\xd8\xff]", re.DOTALL
+)  # begins one with a length, or is the end
 _PNG_START, _PNG_END, _PNG_BIT_DEPTH = b"\x89PNG", b"IEND", 24
 _ENDS_PERCENT = (0.1, 99.9)  # of the values: what is beyond is black or white
 _WIDE = 32768  # range of values from which on the upper eight bits show enough
 _STRETCHED_BY = 16  # images of a recording
 _COMPARED_IMAGES = 3
-_NUMBER = re.compile(r"((?<![A-Za-z\d.])\d+\.\d+(?=\.\w+$)|\d+)")  # a stamp such as 1700000000.5 is one number
+_NUMBER = re.compile(
+    r"((?<![A-Za-z\d.])\d+\.\d+(?=\.\w+$)|\d+)"
+)  # a stamp such as 1700000000.5 is one number
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -143,7 +155,9 @@ def read_depth_map(path: Path, per_metre: float = 256.0, unknown: int = 0) -> ND
     """
     values = read_values(path)
     if values.ndim != 2 or values.dtype != np.uint16:
-        raise DataError(f"depth map {path} is no 16-bit grey PNG: write it again, or remove the folder")
+        raise DataError(
+            f"depth map {path} is no 16-bit grey PNG: write it again, or remove the folder"
+        )
     return np.where(values == unknown, 0, values) / per_metre
 
 
@@ -157,7 +171,9 @@ def decode_values(data: bytes, where: str, flags: int = cv2.IMREAD_UNCHANGED) ->
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
         if "MAX_IMAGE_PIXELS" in str(error):
-            raise DataError(f"{where} has more pixels than any camera: resize it, or leave it out") from error
+            raise DataError(
+                f"{where} has more pixels than any camera: resize it, or leave it out"
+            ) from error
         raise DataError(f"{where} cannot be decoded: {error.err or error}") from error
     if image is None:
         raise DataError(f"{where} cannot be decoded: it is damaged or not an image; copy it again")
@@ -203,9 +219,13 @@ def first_size(files: Sequence[Path]) -> tuple[int, int]:
 def report_unreadable(reasons: Sequence[str], total: int, what: str) -> None:
     """Warn once that some of many are left out, by the reason of the first; ``DataError`` where none can be read."""
     if reasons and len(reasons) == total:
-        raise DataError(reasons[0] if total == 1 else f"none of {total} {what} can be read: {reasons[0]}")
+        raise DataError(
+            reasons[0] if total == 1 else f"none of {total} {what} can be read: {reasons[0]}"
+        )
     if reasons:
-        logger.warning("%d of %d %s cannot be read and are left out: %s", len(reasons), total, what, reasons[0])
+        logger.warning(
+            "%d of %d %s cannot be read and are left out: %s", len(reasons), total, what, reasons[0]
+        )
 
 
 def resize_image(image: Image, height: int, width: int) -> Image:

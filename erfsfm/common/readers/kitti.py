@@ -70,7 +70,9 @@ class OdometryRoot:
         try:
             return int(json.loads(path.read_text(encoding="utf-8"))["seed"])
         except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
-            raise DataError(f"{path} must hold the simulation's seed: {error!r}; simulate again") from error
+            raise DataError(
+                f"{path} must hold the simulation's seed: {error!r}; simulate again"
+            ) from error
 
     def recording_name(self, sequence: str) -> str:
         """A sequence in the leak record: the simulated world by its seed, or the KITTI sequence by its number."""
@@ -90,7 +92,9 @@ def find_odometry_root(dataset: Path) -> OdometryRoot | None:
 
 def odometry_camera(folder: Path) -> int | None:
     """The camera of a sequence to use: colour before grey, left before right; None without any images."""
-    return next((camera for camera in ODOMETRY_CAMERAS if has_images(folder / f"image_{camera}")), None)
+    return next(
+        (camera for camera in ODOMETRY_CAMERAS if has_images(folder / f"image_{camera}")), None
+    )
 
 
 def find_drives(dataset: Path) -> dict[str, Path]:
@@ -98,7 +102,9 @@ def find_drives(dataset: Path) -> dict[str, Path]:
     own = _DRIVE.fullmatch(dataset.absolute().name)
     if own is not None:
         if own["kind"] == "extract":
-            raise DataError(f"{dataset} is not rectified: download the drive as synced+rectified (_sync)")
+            raise DataError(
+                f"{dataset} is not rectified: download the drive as synced+rectified (_sync)"
+            )
         return {own["name"]: dataset}
     if not dataset.is_dir():
         return {}
@@ -118,10 +124,16 @@ def drive_name(text: str) -> str:
 
 
 ODOMETRY_CALIBRATION = "calib.txt"
-CAM_TO_CAM, VELO_TO_CAM, IMU_TO_VELO = "calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt"
+CAM_TO_CAM, VELO_TO_CAM, IMU_TO_VELO = (
+    "calib_cam_to_cam.txt",
+    "calib_velo_to_cam.txt",
+    "calib_imu_to_velo.txt",
+)
 _SHIPPED = {
     ODOMETRY_CALIBRATION: "with the odometry images (data_odometry_calib.zip); copy it there",
-    **dict.fromkeys((CAM_TO_CAM, VELO_TO_CAM, IMU_TO_VELO), "as DATE_calib.zip; copy it beside the drives"),
+    **dict.fromkeys(
+        (CAM_TO_CAM, VELO_TO_CAM, IMU_TO_VELO), "as DATE_calib.zip; copy it beside the drives"
+    ),
 }
 ASPECT_TOLERANCE = 0.01
 CAMERA_HEIGHT_M = 1.65  # of the car's cameras above the road
@@ -136,7 +148,10 @@ class CalibrationFile:
         self.path = path
         if not path.is_file():
             shipped = _SHIPPED.get(path.name)
-            raise DataError(f"no {path.name} in {path.parent}" + (f": KITTI ships it {shipped}" if shipped else ""))
+            raise DataError(
+                f"no {path.name} in {path.parent}"
+                + (f": KITTI ships it {shipped}" if shipped else "")
+            )
         try:
             text = read_text(path)
         except (OSError, UnicodeDecodeError) as error:
@@ -153,13 +168,17 @@ class CalibrationFile:
         count = int(np.prod(shape))
         words = self._rows.get(key)
         if words is None:
-            raise DataError(f"no row {key} in {self.path}: found {', '.join(self._rows) or 'nothing'}")
+            raise DataError(
+                f"no row {key} in {self.path}: found {', '.join(self._rows) or 'nothing'}"
+            )
         try:
             numbers = np.array([float(word) for word in words])
         except ValueError as error:
             raise DataError(f"{self.path} row {key}: {error}; it needs {count} numbers") from error
         if len(numbers) != count or not np.isfinite(numbers).all():
-            raise DataError(f"{self.path} row {key} has {len(numbers)} numbers: it needs {count} finite ones")
+            raise DataError(
+                f"{self.path} row {key} has {len(numbers)} numbers: it needs {count} finite ones"
+            )
         return numbers.reshape(shape)
 
     def transform(self, R_key: str, t_key: str) -> FloatArray:
@@ -170,7 +189,9 @@ class CalibrationFile:
         """Rectified camera 0 to the rectified camera of projection matrix ``key``, ``(4, 4)``, metres."""
         P = self.matrix(key, (3, 4))
         if not abs(np.linalg.det(P[:, :3])) > 0:
-            raise DataError(f"{self.path} row {key} is no K [I | t] with positive focal lengths; restore the file")
+            raise DataError(
+                f"{self.path} row {key} is no K [I | t] with positive focal lengths; restore the file"
+            )
         t_camera_cam0: FloatArray = np.linalg.inv(P[:, :3]) @ P[:, 3]
         return _rigid(np.eye(3), t_camera_cam0)
 
@@ -196,10 +217,14 @@ class CalibrationFile:
         """A camera (``"02"``) of ``calib_cam_to_cam.txt``, for images resized to the given size."""
         size = self.matrix(f"S_rect_{camera}", (2,))
         if not (size > 0).all():
-            raise DataError(f"{self.path} row S_rect_{camera} must hold a positive width and height; restore the file")
+            raise DataError(
+                f"{self.path} row S_rect_{camera} must hold a positive width and height; restore the file"
+            )
         full_width, full_height = int(size[0]), int(size[1])
         if abs(width * full_height / (height * full_width) - 1) > ASPECT_TOLERANCE:
-            raise DataError(f"{self.path} is of another camera, or images were cropped to {width}x{height}")
+            raise DataError(
+                f"{self.path} is of another camera, or images were cropped to {width}x{height}"
+            )
         full = self._pinhole(f"P_rect_{camera}", full_width, full_height)
         require_plausible(full, f"{self.path} row P_rect_{camera}")
         return full.resized(width, height)
@@ -209,7 +234,9 @@ class CalibrationFile:
         fx, fy, cx, cy = (float(value) for value in (P[0, 0], P[1, 1], P[0, 2], P[1, 2]))
         skew_free = P[0, 1] == P[1, 0] == P[2, 0] == P[2, 1] == 0 and P[2, 2] == 1
         if not (fx > 0 and fy > 0 and skew_free):
-            raise DataError(f"{self.path} row {key} is no K [I | t] with positive focal lengths; restore the file")
+            raise DataError(
+                f"{self.path} row {key} is no K [I | t] with positive focal lengths; restore the file"
+            )
         return Pinhole(width, height, fx, fy, cx, cy)
 
 
@@ -233,7 +260,9 @@ def read_packet(path: Path) -> FloatArray:
     except (OSError, ValueError) as error:
         raise DataError(f"cannot read OXTS packet {path}: {error}") from error
     if len(row) != _COLUMNS or not np.isfinite(row).all():
-        raise DataError(f"OXTS packet {path} has {len(row)} numbers, not {_COLUMNS} finite ones: copy it again")
+        raise DataError(
+            f"OXTS packet {path} has {len(row)} numbers, not {_COLUMNS} finite ones: copy it again"
+        )
     return np.array(row)
 
 
@@ -241,7 +270,9 @@ def velocity(oxts: Path, frame: int) -> FloatArray:
     """Of the car in m/s: north, east, up ``(3,)``, from the packet of a frame in ``oxts/data``."""
     path = oxts / f"{frame:010d}.txt"
     if not path.is_file():
-        raise DataError(f"{path} is missing: the speed of the car comes from a packet of the GPS/IMU a frame")
+        raise DataError(
+            f"{path} is missing: the speed of the car comes from a packet of the GPS/IMU a frame"
+        )
     return read_packet(path)[[VELOCITY_NORTH, VELOCITY_EAST, VELOCITY_UP]]
 
 
@@ -253,14 +284,20 @@ def read_velodyne(path: Path, columns: int = VELODYNE_COLUMNS) -> NDArray[np.flo
     try:
         content = read_bytes(path, _MOST_BYTES)
     except OSError as error:
-        raise DataError(f"{path} cannot be read ({error.strerror}); restore the scan or remove the folder") from error
+        raise DataError(
+            f"{path} cannot be read ({error.strerror}); restore the scan or remove the folder"
+        ) from error
     values = np.frombuffer(content[: len(content) // 4 * 4], dtype=np.float32)
     if len(values) == 0 or len(values) % columns:
-        raise DataError(f"{path} is no Velodyne scan: wanted {columns} float32 a point; got {len(content)} bytes")
+        raise DataError(
+            f"{path} is no Velodyne scan: wanted {columns} float32 a point; got {len(content)} bytes"
+        )
     points = values.reshape(-1, columns)[:, :3].astype(np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
         distances = np.linalg.norm(points, axis=1)
     measured = (distances > 0) & (distances < _FARTHEST_M)
     if not measured.any():
-        raise DataError(f"{path} has no point at a distance that a LiDAR measures; restore the scan or remove it")
+        raise DataError(
+            f"{path} has no point at a distance that a LiDAR measures; restore the scan or remove it"
+        )
     return np.asarray(points[measured])

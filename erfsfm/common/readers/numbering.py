@@ -82,7 +82,9 @@ def by_number(paths: list[Path]) -> NumberedFiles:
     """Files that KITTI names by their number alone, at least one, in order."""
     for path in paths:
         if not path.stem.isdecimal():
-            raise DataError(f"{path} is not named by its number ({0:0{len(paths[0].stem)}d}{path.suffix}): rename it")
+            raise DataError(
+                f"{path} is not named by its number ({0:0{len(paths[0].stem)}d}{path.suffix}): rename it"
+            )
     return _numbered(paths, [int(path.stem) for path in paths])
 
 
@@ -94,7 +96,11 @@ def by_name(paths: list[Path]) -> NumberedFiles:
     matches = [_NUMBERED.fullmatch(path.stem) for path in paths]
     numbers = [int(match["number"]) for match in matches if match is not None]
     prefixes = {None if match is None else match["prefix"] for match in matches}
-    if None in prefixes or len(prefixes) > 1 or (len(numbers) > 1 and np.median(np.diff(numbers)) != 1):
+    if (
+        None in prefixes
+        or len(prefixes) > 1
+        or (len(numbers) > 1 and np.median(np.diff(numbers)) != 1)
+    ):
         return in_order(paths)
     return replace(_numbered(paths, numbers), first=0)
 
@@ -111,9 +117,13 @@ def by_table(listed: list[Path], table: Path) -> NumberedFiles:
     """
     there = [row for row, path in enumerate(listed) if path.is_file()]
     if not there:
-        raise DataError(f"none of the {len(listed)} images that {table} names is there: unpack them")
+        raise DataError(
+            f"none of the {len(listed)} images that {table} names is there: unpack them"
+        )
     names = tuple(path.name for path in listed[there[0] : there[-1] + 1])
-    return NumberedFiles(tuple(listed[row] for row in there), tuple(row - there[0] for row in there), there[0], names)
+    return NumberedFiles(
+        tuple(listed[row] for row in there), tuple(row - there[0] for row in there), there[0], names
+    )
 
 
 def _numbered(paths: list[Path], numbers: list[int]) -> NumberedFiles:

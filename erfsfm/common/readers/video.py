@@ -53,7 +53,9 @@ class VideoFrames:
             shown_s = np.array(self._times_ms) / 1000
         self._frames = announced if shown_s is None else len(shown_s)
         if self._frames <= 0:
-            raise DataError(f"video {path} has no frame to decode: copy it again, or convert it to mp4 (H.264)")
+            raise DataError(
+                f"video {path} has no frame to decode: copy it again, or convert it to mp4 (H.264)"
+            )
         if 0 < announced != self._frames:
             logger.warning(
                 "video %s announces %d frames and has %d: it may be cut off, or of an uneven rate",
@@ -94,7 +96,9 @@ class VideoFrames:
             self._capture, self._next = _capture(self._path), 0
         while self._next <= index:
             if not self._grab():
-                raise DataError(f"video {self._path} breaks off at frame {self._next}: use the frames 0:{self._next}")
+                raise DataError(
+                    f"video {self._path} breaks off at frame {self._next}: use the frames 0:{self._next}"
+                )
         read, image = self._capture.retrieve()
         if not read:
             raise DataError(f"video {self._path} frame {index} cannot be decoded: copy it again")
@@ -114,7 +118,10 @@ class VideoFrames:
         if not 0 < index < len(self._times_ms):
             return False
         self._capture.set(cv2.CAP_PROP_POS_FRAMES, index - 1)
-        if not self._capture.grab() or self._capture.get(cv2.CAP_PROP_POS_MSEC) != self._times_ms[index - 1]:
+        if (
+            not self._capture.grab()
+            or self._capture.get(cv2.CAP_PROP_POS_MSEC) != self._times_ms[index - 1]
+        ):
             return False
         self._next = index
         return True
@@ -129,7 +136,9 @@ def _packet_times(path: Path) -> NDArray[np.float64] | None:
     try:
         with av.open(str(path)) as container:
             stream = container.streams.video[0]
-            packets = (packet for packet in container.demux(stream) if not packet.is_discard)  # trimmed on a phone
+            packets = (
+                packet for packet in container.demux(stream) if not packet.is_discard
+            )  # trimmed on a phone
             shown = sorted(packet.pts for packet in packets if packet.pts is not None)
             return np.array(shown, dtype=np.float64) * float(stream.time_base)
     except (av.error.FFmpegError, IndexError, TypeError) as error:
@@ -139,7 +148,9 @@ def _packet_times(path: Path) -> NDArray[np.float64] | None:
 def list_videos(folder: Path) -> list[Path]:
     """The video files directly in a folder, without hidden ones."""
     visible = (path for path in folder.iterdir() if not path.name.startswith("."))
-    return sorted(path for path in visible if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file())
+    return sorted(
+        path for path in visible if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
+    )
 
 
 def video_name(video: Path) -> str:
@@ -156,8 +167,12 @@ def clip_name(video: Path) -> str:
 
 
 def _capture(path: Path) -> cv2.VideoCapture:
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", _QUIET)  # errors are reported by DataError alone
+    os.environ.setdefault(
+        "OPENCV_FFMPEG_LOGLEVEL", _QUIET
+    )  # errors are reported by DataError alone
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
-        raise DataError(f"video {path} cannot be opened: copy it again, or convert it to mp4 (H.264)")
+        raise DataError(
+            f"video {path} cannot be opened: copy it again, or convert it to mp4 (H.264)"
+        )
     return capture

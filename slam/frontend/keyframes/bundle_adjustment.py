@@ -85,19 +85,27 @@ class BundleAdjustment:
         self._learned = np.isfinite(self._log_depth)
         self._log_depth[~self._learned] = 0.0
         # images of one point share the network's error
-        times = np.bincount(sightings.point[self._learned], minlength=int(sightings.point.max(initial=-1)) + 1)
+        times = np.bincount(
+            sightings.point[self._learned], minlength=int(sightings.point.max(initial=-1)) + 1
+        )
         self._depth_sigma = sightings.depth_sigma * np.sqrt(np.maximum(times[sightings.point], 1))
         self._column = np.where(free, np.cumsum(free) - 1, -1)
         self._free = free
         self._points = int(sightings.point.max()) + 1 if len(sightings) else 0
         ends = np.searchsorted(sightings.camera, np.arange(len(free) + 1))
         self._rows = [slice(first, last) for first, last in pairwise(ends.tolist())]
-        learned = [first + np.flatnonzero(self._learned[first:last]) for first, last in pairwise(ends)]
+        learned = [
+            first + np.flatnonzero(self._learned[first:last]) for first, last in pairwise(ends)
+        ]
         self._learned_rows = [rows for rows in learned if len(rows)]
         self._blocks = self._eliminated_together()
 
     def solve(
-        self, T_camera_world: FloatArray, points: FloatArray, iterations: int, tolerance: float = 1e-4
+        self,
+        T_camera_world: FloatArray,
+        points: FloatArray,
+        iterations: int,
+        tolerance: float = 1e-4,
     ) -> Adjusted:
         """Adjust from a start until the cost falls by less than ``tolerance`` of itself."""
         T, X = T_camera_world.copy(), points.copy()
@@ -112,7 +120,9 @@ class BundleAdjustment:
             if step is not None:
                 by_camera, by_point = step
                 T_new, X_new = T.copy(), X.copy()
-                T_new[self._free] = compose(from_rotation_vector(by_camera[:, :3], by_camera[:, 3:]), T[self._free])
+                T_new[self._free] = compose(
+                    from_rotation_vector(by_camera[:, :3], by_camera[:, 3:]), T[self._free]
+                )
                 X_new[: self._points] += by_point
                 residuals_new = self.residuals(T_new, X_new)
                 cost_new = self._cost(residuals_new)
@@ -126,7 +136,9 @@ class BundleAdjustment:
             if damping > _MOST_DAMPING:
                 break
         pixel = np.linalg.norm(residuals[:, :2], axis=1) * self._pixel_sigma
-        return Adjusted(T, X, np.where(self._in_cameras(T, X)[:, 2] > LEAST_DEPTH, pixel, np.inf), cost)
+        return Adjusted(
+            T, X, np.where(self._in_cameras(T, X)[:, 2] > LEAST_DEPTH, pixel, np.inf), cost
+        )
 
     def residuals(self, T_camera_world: FloatArray, points: FloatArray) -> FloatArray:
         """Of both pixel coordinates and of the logarithm of depth, over their sigmas ``(S, 3)``."""
@@ -146,7 +158,9 @@ class BundleAdjustment:
         if not self._learned_rows:
             return whitened
         rows = np.concatenate(self._learned_rows)
-        image = np.repeat(np.arange(len(self._learned_rows)), [len(each) for each in self._learned_rows])
+        image = np.repeat(
+            np.arange(len(self._learned_rows)), [len(each) for each in self._learned_rows]
+        )
         own, sigma = logarithms[rows], self._depth_sigma[rows]
         near, full = self._huber * sigma, sigma**-2
         unit = np.array([median(logarithms[each]) for each in self._learned_rows])
@@ -156,7 +170,9 @@ class BundleAdjustment:
         whitened[rows] = (own - unit[image]) / sigma
         return whitened
 
-    def jacobians(self, T_camera_world: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def jacobians(
+        self, T_camera_world: FloatArray, points: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Derivatives of the residuals by their camera's perturbation ``(6, 3, S)`` and their point ``(3, 3, S)``."""
         X = self._in_cameras(T_camera_world, points)
         by_camera = np.zeros((6, 3, len(X)))
@@ -189,7 +205,9 @@ class BundleAdjustment:
         root = np.sqrt(np.minimum(self._huber / np.maximum(length, 1e-12), 1.0))
         return np.asarray(root[:, [0, 0, 1]])
 
-    def _normal_equations(self, T: FloatArray, X: FloatArray, residuals: FloatArray) -> _StepByDamping:
+    def _normal_equations(
+        self, T: FloatArray, X: FloatArray, residuals: FloatArray
+    ) -> _StepByDamping:
         """Steps of cameras ``(F, 6)`` and points ``(P, 3)`` by the damping, None where the system is singular.
 
         Its parts are those of cameras ``U`` ``(F, 6, 6)`` and points ``V`` ``(P, 3, 3)``, their coupling ``W``
@@ -221,7 +239,9 @@ class BundleAdjustment:
             coupled = []
             for block in self._blocks:
                 coupling = W[..., block.sightings]
-                inverse = np.ascontiguousarray(V_inverse[block.points[block.local_point]].transpose(1, 2, 0))
+                inverse = np.ascontiguousarray(
+                    V_inverse[block.points[block.local_point]].transpose(1, 2, 0)
+                )
                 # row by row: products of small matrices one by one take ten times as long
                 with_points = sum(coupling[:, i, None] * inverse[i] for i in range(3))
                 W_block, WV = (block.dense(part) for part in (coupling, with_points))
@@ -233,7 +253,9 @@ class BundleAdjustment:
             if by_camera is None:
                 return None
             for block, W_block in coupled:
-                by_point[block.points] -= (by_camera[block.cameras].ravel() @ W_block).reshape(-1, 3)
+                by_point[block.points] -= (by_camera[block.cameras].ravel() @ W_block).reshape(
+                    -1, 3
+                )
             return by_camera, np.einsum("pij,pj->pi", V_inverse, by_point)
 
         return step
@@ -249,14 +271,18 @@ class BundleAdjustment:
         place[order] = np.arange(self._points)
         blocks = []
         by_place = rows[np.argsort(place[point[rows]], kind="stable")]
-        starts = np.searchsorted(place[point[by_place]], np.arange(0, self._points + _BLOCK, _BLOCK))
+        starts = np.searchsorted(
+            place[point[by_place]], np.arange(0, self._points + _BLOCK, _BLOCK)
+        )
         for n, (start, end) in enumerate(pairwise(starts)):
             if start == end:
                 continue
             sightings = by_place[start:end]
             cameras, local = np.unique(camera[sightings], return_inverse=True)
             points = order[n * _BLOCK : (n + 1) * _BLOCK]
-            blocks.append(_Block(sightings, cameras, local, points, place[point[sightings]] - n * _BLOCK))
+            blocks.append(
+                _Block(sightings, cameras, local, points, place[point[sightings]] - n * _BLOCK)
+            )
         return blocks
 
 
@@ -299,13 +325,20 @@ def solve_sum(parts: Sequence[Part], side: FloatArray) -> FloatArray | None:
             S = np.zeros((len(right), len(right)))
             for rows, (_, part) in zip(unknowns, parts, strict=True):
                 S[np.ix_(rows, rows)] += part
-            return np.asarray(cho_solve(cho_factor(S, check_finite=False), right, check_finite=False)).reshape(-1, 6)
+            return np.asarray(
+                cho_solve(cho_factor(S, check_finite=False), right, check_finite=False)
+            ).reshape(-1, 6)
         of_rows = np.concatenate([np.repeat(each, len(each)) for each in unknowns])
         columns = np.concatenate([np.tile(each, len(each)) for each in unknowns])
         values = np.concatenate([part.ravel() for _, part in parts])
         system = csc_array((values, (of_rows, columns)), shape=(len(right), len(right)))
         # as a symmetric one: its pattern decides the order, and pivots stay on the diagonal
-        factors = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        factors = splu(
+            system,
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
     except (LinAlgError, RuntimeError):
         return None
     return np.asarray(factors.solve(right)).reshape(-1, 6)

@@ -57,7 +57,11 @@ def image_shift(before: SmallImage, now: SmallImage) -> FloatArray:
 
 
 def image_turn(
-    before: SmallImage, now: SmallImage, R_guess: FloatArray, shift: FloatArray, intrinsics: Intrinsics
+    before: SmallImage,
+    now: SmallImage,
+    R_guess: FloatArray,
+    shift: FloatArray,
+    intrinsics: Intrinsics,
 ) -> ImageTurn:
     """The turn from a guess, from the shift of the whole image or from none, whichever makes the images alike."""
     if before.shape != now.shape:
@@ -73,27 +77,43 @@ def image_turn(
     turns = [ImageTurn(guess) for guess in (R_guess, R_shift, np.eye(3))]
     for first, second, size_ratio in pairs:
         problem = _Alignment(first, second, intrinsics, size_ratio)
-        turns = [max((problem.solve(turn.R_now_before) for turn in turns), key=lambda turn: turn.correlation)]
+        turns = [
+            max(
+                (problem.solve(turn.R_now_before) for turn in turns),
+                key=lambda turn: turn.correlation,
+            )
+        ]
     return turns[0]
 
 
 class _Alignment:
     """Two images of local contrast, one of which is turned until they are alike."""
 
-    def __init__(self, before: SmallImage, now: SmallImage, intrinsics: Intrinsics, scale: float) -> None:
+    def __init__(
+        self, before: SmallImage, now: SmallImage, intrinsics: Intrinsics, scale: float
+    ) -> None:
         sigma = _SMOOTH_PX * scale * _REDUCED
         first, self._now = _local_contrast(before, sigma), _local_contrast(now, sigma)
         self._focal = np.array([intrinsics.fx * scale, intrinsics.fy * scale], np.float32)
-        self._centre = np.array([(intrinsics.cx + 0.5) * scale - 0.5, (intrinsics.cy + 0.5) * scale - 0.5], np.float32)
+        self._centre = np.array(
+            [(intrinsics.cx + 0.5) * scale - 0.5, (intrinsics.cy + 0.5) * scale - 0.5], np.float32
+        )
         height, width = first.shape
         y, x = np.mgrid[:height, :width].reshape(2, -1)
         u, v = (x - self._centre[0]) / self._focal[0], (y - self._centre[1]) / self._focal[1]
         self._rays = np.stack([u, v, np.ones_like(u)]).astype(np.float32)
         self._first = first.ravel()
-        by_u, by_v = (focal * slope.ravel() for focal, slope in zip(self._focal, slopes_of(first), strict=True))
+        by_u, by_v = (
+            focal * slope.ravel()
+            for focal, slope in zip(self._focal, slopes_of(first), strict=True)
+        )
         # of the first image, by a small turn of its rays
         self._jacobian = np.stack(
-            [-by_u * u * v - by_v * (1 + v * v), by_u * (1 + u * u) + by_v * u * v, by_v * u - by_u * v]
+            [
+                -by_u * u * v - by_v * (1 + v * v),
+                by_u * (1 + u * u) + by_v * u * v,
+                by_v * u - by_u * v,
+            ]
         ).astype(np.float32)
 
     def solve(self, R: FloatArray) -> ImageTurn:
@@ -128,10 +148,15 @@ class _Alignment:
 def _local_contrast(image: SmallImage, sigma: float) -> SmallImage:
     """Without its local mean and over its local contrast, so that neither light nor shadow is motion."""
     high = image - cv2.GaussianBlur(image, (0, 0), sigma)
-    return np.asarray(high / np.sqrt(cv2.GaussianBlur(high * high, (0, 0), sigma) + _LEAST_CONTRAST**2), np.float32)
+    return np.asarray(
+        high / np.sqrt(cv2.GaussianBlur(high * high, (0, 0), sigma) + _LEAST_CONTRAST**2),
+        np.float32,
+    )
 
 
-def turned(pixels: NDArray[np.float32], R_now_before: FloatArray, intrinsics: Intrinsics) -> NDArray[np.float32]:
+def turned(
+    pixels: NDArray[np.float32], R_now_before: FloatArray, intrinsics: Intrinsics
+) -> NDArray[np.float32]:
     """Where pixels ``(M, 2)`` of the last image are after a turn; those behind the camera stay."""
     rays = intrinsics.rays(pixels.astype(np.float64)) @ R_now_before.T
     ahead = rays[:, 2] > 0.1
@@ -147,12 +172,18 @@ def in_middle_row(pixels: _Places, turn: FloatArray, intrinsics: Intrinsics) -> 
     if not intrinsics.readout_s or not len(pixels):
         return pixels
     seconds = intrinsics.readout_s * ((pixels[:, 1] + 0.5) / intrinsics.height - 0.5)
-    rays = Rotation.from_rotvec(-seconds[:, None] * turn).apply(intrinsics.rays(pixels.astype(np.float64)))
+    rays = Rotation.from_rotvec(-seconds[:, None] * turn).apply(
+        intrinsics.rays(pixels.astype(np.float64))
+    )
     return intrinsics.project(rays).astype(pixels.dtype)
 
 
 def measured_turn(
-    before: Pixels | FloatArray, pixels: Pixels, seconds: float, turn: FloatArray, intrinsics: Intrinsics
+    before: Pixels | FloatArray,
+    pixels: Pixels,
+    seconds: float,
+    turn: FloatArray,
+    intrinsics: Intrinsics,
 ) -> FloatArray:
     """The turn a second ``(3,)`` between two images, started from the one before; zero with few corners.
 

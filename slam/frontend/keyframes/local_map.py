@@ -150,13 +150,21 @@ class LocalMap:
 
     def copy(self) -> LocalMap:
         """A snapshot, which stays while this map grows."""
-        own = self.keyframes.copy(), self.points.copy(), self.frames.copy(), self.started, self.turns.copy()
+        own = (
+            self.keyframes.copy(),
+            self.points.copy(),
+            self.frames.copy(),
+            self.started,
+            self.turns.copy(),
+        )
         return LocalMap(*own)
 
     @property
     def T_world_camera(self) -> FloatArray:
         """Poses of the keyframes ``(K, 4, 4)``."""
-        return invert(np.array([keyframe.T_camera_world for keyframe in self.keyframes]).reshape(-1, 4, 4))
+        return invert(
+            np.array([keyframe.T_camera_world for keyframe in self.keyframes]).reshape(-1, 4, 4)
+        )
 
     def known(self, track_ids: TrackIds) -> NDArray[np.bool_]:
         """Which tracks have a point ``(M,)``."""
@@ -172,11 +180,15 @@ class LocalMap:
         """Add the newest keyframe; images of old ones are not kept."""
         self.keyframes.append(keyframe)
         if len(self.keyframes) > _IMAGES_KEPT:
-            self.keyframes[-_IMAGES_KEPT - 1] = replace(self.keyframes[-_IMAGES_KEPT - 1], grey=None)
+            self.keyframes[-_IMAGES_KEPT - 1] = replace(
+                self.keyframes[-_IMAGES_KEPT - 1], grey=None
+            )
 
     def views(self, points: FloatArray) -> list[View]:
         """Corners of all keyframes with their points in the camera, of ``points`` ``(N, 3)`` in the world by track."""
-        in_cameras = (apply(k.T_camera_world, points[k.track_ids]).astype(np.float32) for k in self.keyframes)
+        in_cameras = (
+            apply(k.T_camera_world, points[k.track_ids]).astype(np.float32) for k in self.keyframes
+        )
         pairs = zip(self.keyframes, in_cameras, strict=True)
         return [View(k.index, k.pixels.astype(np.float32), k.descriptors, own) for k, own in pairs]
 
@@ -184,7 +196,9 @@ class LocalMap:
         """Of all points, between those of the keyframes that see them."""
         parallax = Parallax(self.points)
         for keyframe in keyframes:
-            parallax.see(keyframe.T_camera_world, keyframe.track_ids[self.known(keyframe.track_ids)])
+            parallax.see(
+                keyframe.T_camera_world, keyframe.track_ids[self.known(keyframe.track_ids)]
+            )
         return parallax
 
     def add_points(self, intrinsics: Intrinsics) -> None:
@@ -215,13 +229,18 @@ class LocalMap:
         seen[np.concatenate([keyframe.track_ids for keyframe in self.keyframes[first:]])] = True
         seen &= np.isfinite(self.points[:, 0])
         # older keyframes that share most of these points
-        shared = [(int(seen[keyframe.track_ids].sum()), k) for k, keyframe in enumerate(self.keyframes[:first])]
+        shared = [
+            (int(seen[keyframe.track_ids].sum()), k)
+            for k, keyframe in enumerate(self.keyframes[:first])
+        ]
         best = sorted((pair for pair in shared if pair[0] >= _SHARED), reverse=True)[:_ADJUSTED]
         fixed = sorted(k for _, k in best)
         chosen = [*fixed, *range(first, len(self.keyframes))]
         sightings, track_ids = self.sightings(chosen, seen, intrinsics)
         limits = _YOUNG_LIMITS if len(self.keyframes) <= _YOUNG else _LIMITS
-        gone, dead = self.solve(chosen, max(len(fixed), 1 + (first > 0)), sightings, track_ids, intrinsics, limits)
+        gone, dead = self.solve(
+            chosen, max(len(fixed), 1 + (first > 0)), sightings, track_ids, intrinsics, limits
+        )
         return np.concatenate([dead, gone[-1]])
 
     def solve(
@@ -245,7 +264,10 @@ class LocalMap:
         solved = problem.solve(poses, self.points[track_ids], *limits)
         self.points[track_ids] = solved.points
         bad = solved.residual_px > outlier_px
-        gone = [track_ids[sightings.point[bad & (sightings.camera == row)]] for row in range(len(chosen))]
+        gone = [
+            track_ids[sightings.point[bad & (sightings.camera == row)]]
+            for row in range(len(chosen))
+        ]
         for k, tracks, T in zip(chosen, gone, solved.T_camera_world, strict=True):
             self.keyframes[k] = replace(self.keyframes[k].without(tracks), T_camera_world=T)
         dead = track_ids[np.bincount(sightings.point[~bad], minlength=len(track_ids)) < 2]
@@ -280,7 +302,9 @@ class LocalMap:
         """Corners of a new keyframe aligned to the earliest of the last keyframes that sees them, against drift."""
         pixels, pending = pixels.copy(), np.ones(len(track_ids), np.bool_)
         for keyframe in self.keyframes[-_ALIGNED_KEYFRAMES:]:
-            _, a, b = np.intersect1d(keyframe.track_ids, track_ids, assume_unique=True, return_indices=True)
+            _, a, b = np.intersect1d(
+                keyframe.track_ids, track_ids, assume_unique=True, return_indices=True
+            )
             a, b = a[pending[b]], b[pending[b]]
             if len(a) < _LEAST_MATCHED:
                 continue
@@ -303,7 +327,11 @@ class LocalMap:
             focal, centre = (intrinsics.fx, intrinsics.fy), (intrinsics.cx, intrinsics.cy)
             projected = (X[:, :2] / z[:, None] * focal + centre).astype(np.float32)
             limit = [intrinsics.width - _BORDER_PX, intrinsics.height - _BORDER_PX]
-            inside = (X[:, 2] > 0) & (projected > _BORDER_PX).all(axis=1) & (projected < limit).all(axis=1)
+            inside = (
+                (X[:, 2] > 0)
+                & (projected > _BORDER_PX).all(axis=1)
+                & (projected < limit).all(axis=1)
+            )
             rows, projected = rows[inside], projected[inside]
             if len(rows) < _LEAST_MATCHED:
                 continue

@@ -33,7 +33,14 @@ from slam.frontend.keyframes.image_turn import (
     small_image,
     turned,
 )
-from slam.frontend.keyframes.local_map import DEPTH_SIGMA, LocalMap, NewImage, TrackedFrame, TrackedKeyframe, TrackIds
+from slam.frontend.keyframes.local_map import (
+    DEPTH_SIGMA,
+    LocalMap,
+    NewImage,
+    TrackedFrame,
+    TrackedKeyframe,
+    TrackIds,
+)
 from slam.frontend.tracking import KEYFRAME_SEARCH, Pixels, are_inside, new_corners, track
 from slam.frontend.visual.two_view import CORNER_CORRELATION
 from slam.geometry.multiview import (
@@ -47,7 +54,14 @@ from slam.geometry.multiview import (
     unit_poses_by_homography,
 )
 from slam.geometry.se3 import FloatArray, apply, compose, invert, make
-from slam.loops.recognition import OF_KEYFRAMES, LoopVerifier, PlaceIndex, Sighting, describe, matches
+from slam.loops.recognition import (
+    OF_KEYFRAMES,
+    LoopVerifier,
+    PlaceIndex,
+    Sighting,
+    describe,
+    matches,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -55,9 +69,14 @@ logger = logging.getLogger(__name__)
 _SLIPPED = 8.0 / 3.0
 _MOST_FLOW = 4.0
 _LEAST_SHIFT_PX = 16.0  # smaller ones flow finds by itself
-_LEAST_CORRELATION, _SURE_CORRELATION = 0.4, 0.8  # of turned images, for a guess, and for a measurement
+_LEAST_CORRELATION, _SURE_CORRELATION = (
+    0.4,
+    0.8,
+)  # of turned images, for a guess, and for a measurement
 _KEYFRAME_TRACKS_RATIO = 0.25  # ratio of a keyframe's corners still tracked that asks for another
-_MAX_LOST_S = 0.35  # seconds without a pose after which a new map is begun, the next frame's included
+_MAX_LOST_S = (
+    0.35  # seconds without a pose after which a new map is begun, the next frame's included
+)
 _LAST_FRAMES = 4  # frames in which a pose is looked up
 # median parallax that asks for a keyframe, over the image width; in a map of few keyframes
 _PARALLAX_RATIO, _YOUNG_PARALLAX_RATIO = 0.03, 0.0125
@@ -69,8 +88,13 @@ _PLACES_TRIED = 6
 # a single image has no points of its own that would confirm the pose, so it takes twice those of a loop
 _LEAST_CONFIRMING = 30
 _FIRST_INLIER_PX = 1.0
-_FIRST_LIMITS = 30, 1e-4  # iterations of an adjustment, and the relative fall of the cost at which it ends
-_GAIN = 0.5 * (3.0 * CORNER_CORRELATION) ** 2  # of the cost: three sigmas, of corners whose errors are correlated
+_FIRST_LIMITS = (
+    30,
+    1e-4,
+)  # iterations of an adjustment, and the relative fall of the cost at which it ends
+_GAIN = (
+    0.5 * (3.0 * CORNER_CORRELATION) ** 2
+)  # of the cost: three sigmas, of corners whose errors are correlated
 
 
 class KeyframeOdometry:
@@ -102,7 +126,9 @@ class KeyframeOdometry:
         self._turn_rate = np.zeros(3)  # a second, where the shutter rolls
         self._small: SmallImage = np.zeros((0, 0), np.float32)
         self.events: list[TrackingEvent] = []
-        self._spread: FloatArray | None = None  # of the points of the last keyframe, once they are looked for
+        self._spread: FloatArray | None = (
+            None  # of the points of the last keyframe, once they are looked for
+        )
         self._relocalises = relocalises
         self._relocaliser: Relocaliser | None = None  # of the lost map
 
@@ -122,11 +148,15 @@ class KeyframeOdometry:
 
     def _relocalise(self, lost: LocalMap, frame: Frame) -> None:
         """Look for the camera in the lost map; where it is found, the map goes on with this frame as a keyframe."""
-        if self._relocaliser is None or self._relocaliser.local is not lost:  # one that begins may be lost at once
+        if (
+            self._relocaliser is None or self._relocaliser.local is not lost
+        ):  # one that begins may be lost at once
             self._relocaliser = Relocaliser(lost, self._intrinsics, self._seed)
         corners = new_corners(frame.grey, _NOTHING[1], _MAX_CORNERS)
         unknown = np.full((len(corners), 3), np.nan, np.float32)
-        found = self._relocaliser.locate(View(frame.index, corners, describe(frame.grey, corners), unknown))
+        found = self._relocaliser.locate(
+            View(frame.index, corners, describe(frame.grey, corners), unknown)
+        )
         if found is None:
             return
         self._relocaliser = None  # the new keyframe changes the map
@@ -149,7 +179,9 @@ class KeyframeOdometry:
         images = before, self._small, self._T_last_step[:3, :3], shift, self._intrinsics
         turn = image_turn(*images) if np.hypot(*shift) > _LEAST_SHIFT_PX else None
         since, self._stamp = frame.stamp - self._stamp, frame.stamp
-        if not self.segments or not self.segments[-1].started:  # without learned depth there are no points
+        if (
+            not self.segments or not self.segments[-1].started
+        ):  # without learned depth there are no points
             del self.segments[-1:]
             self._begin(frame)
             return
@@ -157,8 +189,12 @@ class KeyframeOdometry:
         track_ids, pixels = self._track(segment, frame, turn)
         if self._intrinsics.readout_s:  # how fast the camera turns, for a rolling shutter
             last = segment.frames[-1] if segment.frames else segment.keyframes[-1]
-            _, a, b = np.intersect1d(last.track_ids, track_ids, assume_unique=True, return_indices=True)
-            self._turn_rate = measured_turn(last.pixels[a], pixels[b], since, self._turn_rate, self._intrinsics)
+            _, a, b = np.intersect1d(
+                last.track_ids, track_ids, assume_unique=True, return_indices=True
+            )
+            self._turn_rate = measured_turn(
+                last.pixels[a], pixels[b], since, self._turn_rate, self._intrinsics
+            )
         if self._locate(segment, frame, track_ids, pixels):
             return
         turn = image_turn(*images) if turn is None else turn
@@ -202,7 +238,9 @@ class KeyframeOdometry:
         self._T_camera_world, self._lost = np.eye(4), 0
         self._add_keyframe(self.segments[-1], frame, *_NOTHING)
 
-    def _track(self, segment: LocalMap, frame: Frame, turn: ImageTurn | None) -> tuple[TrackIds, Pixels]:
+    def _track(
+        self, segment: LocalMap, frame: Frame, turn: ImageTurn | None
+    ) -> tuple[TrackIds, Pixels]:
         """Corners of the last keyframe found in a frame; the others stay near their last places, moved by a turn."""
         keyframe = segment.keyframes[-1]
         rows = np.flatnonzero(~self._slipped)
@@ -214,7 +252,11 @@ class KeyframeOdometry:
         corners = keyframe.places[rows].astype(np.float32)
         tracked, kept = track(keyframe.grey, frame.grey, corners, KEYFRAME_SEARCH, guesses)
         kept &= are_inside(tracked, frame.grey.shape)
-        shift = np.median(tracked[kept] - guesses[kept], axis=0) if kept.any() else np.zeros(2, np.float32)
+        shift = (
+            np.median(tracked[kept] - guesses[kept], axis=0)
+            if kept.any()
+            else np.zeros(2, np.float32)
+        )
         self._places[rows] = np.where(kept[:, None], tracked, guesses + shift)
         return keyframe.track_ids[rows[kept]], tracked[kept]
 
@@ -253,9 +295,21 @@ class KeyframeOdometry:
         if self._spread is None:
             self._spread = segment.spread(self._intrinsics)
         spread = self._spread[np.searchsorted(segment.keyframes[-1].track_ids, track_ids)]
-        before = np.isin(track_ids, segment.frames[-1].track_ids) if segment.frames else np.zeros(0, np.bool_)
+        before = (
+            np.isin(track_ids, segment.frames[-1].track_ids)
+            if segment.frames
+            else np.zeros(0, np.bool_)
+        )
         trusted = before if before.sum() >= MIN_POINTS else None
-        pose = resect(guesses, points, pixels.astype(np.float64), self._intrinsics.K, self._seed, spread, trusted)
+        pose = resect(
+            guesses,
+            points,
+            pixels.astype(np.float64),
+            self._intrinsics.K,
+            self._seed,
+            spread,
+            trusted,
+        )
         return pose if len(pose.inliers) >= MIN_POINTS else None
 
     def _check_first_motion(self, segment: LocalMap, track_ids: TrackIds, pixels: Pixels) -> None:
@@ -266,24 +320,39 @@ class KeyframeOdometry:
         settled = segment.parallax(segment.keyframes[-_LOOKED_BACK:]).settled[track_ids]
         if settled.sum() >= MIN_POINTS or known.sum() < MIN_POINTS:
             return
-        tracks, pixels_before, now = track_ids[known], before.pixels[rows[known]], pixels[known].astype(np.float64)
+        tracks, pixels_before, now = (
+            track_ids[known],
+            before.pixels[rows[known]],
+            pixels[known].astype(np.float64),
+        )
         depth = apply(before.T_camera_world, segment.points[tracks])[:, 2]
         T = self._T_camera_world @ invert(before.T_camera_world)
-        T_now_before, depth = first_motion(T, pixels_before, now, depth, self._intrinsics, self._seed)
+        T_now_before, depth = first_motion(
+            T, pixels_before, now, depth, self._intrinsics, self._seed
+        )
         self._T_camera_world = T_now_before @ before.T_camera_world
         points = self._intrinsics.rays(pixels_before) * depth[:, None]
         segment.points[tracks] = apply(invert(before.T_camera_world), points)
 
-    def _moved_since(self, last: TrackedKeyframe, track_ids: TrackIds, pixels: Pixels) -> tuple[float, float]:
+    def _moved_since(
+        self, last: TrackedKeyframe, track_ids: TrackIds, pixels: Pixels
+    ) -> tuple[float, float]:
         """Median parallax, and median shift, of corners ``(M, 2)`` since a keyframe, over the width of the image."""
-        intrinsics, before = self._intrinsics, last.pixels[np.searchsorted(last.track_ids, track_ids)]
+        intrinsics, before = (
+            self._intrinsics,
+            last.pixels[np.searchsorted(last.track_ids, track_ids)],
+        )
         R = self._T_camera_world[:3, :3] @ last.T_camera_world[:3, :3].T
         rays_before, rays = intrinsics.rays(before), intrinsics.rays(pixels.astype(np.float64))
         parallax = parallax_px(rays_before, rays, R, (intrinsics.fx, intrinsics.fy))
         shift = np.linalg.norm(pixels - before, axis=1)
-        return float(np.median(parallax)) / intrinsics.width, float(np.median(shift)) / intrinsics.width
+        return float(np.median(parallax)) / intrinsics.width, float(
+            np.median(shift)
+        ) / intrinsics.width
 
-    def _add_keyframe(self, segment: LocalMap, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
+    def _add_keyframe(
+        self, segment: LocalMap, frame: Frame, track_ids: TrackIds, pixels: Pixels
+    ) -> None:
         """Old corners aligned and found again, new ones between them, then bundle adjustment."""
         self._on_keyframe(frame)
         intrinsics = self._intrinsics
@@ -292,15 +361,25 @@ class KeyframeOdometry:
             image = NewImage(frame.grey, T, intrinsics)
             pixels = segment.aligned(image, track_ids, pixels)
             again, reprojected = segment.found_again(image, track_ids)
-            track_ids, pixels = np.concatenate([track_ids, again]), np.concatenate([pixels, reprojected])
+            track_ids, pixels = (
+                np.concatenate([track_ids, again]),
+                np.concatenate([pixels, reprojected]),
+            )
         fresh = new_corners(frame.grey, pixels, _MAX_CORNERS - len(pixels))
         track_ids = np.concatenate([track_ids, segment.new_tracks(len(fresh))])
         pixels = np.concatenate([pixels, fresh])
         order = np.argsort(track_ids)
         track_ids, places = track_ids[order], pixels[order].astype(np.float64)
         unknown = np.full(len(track_ids), np.nan)
-        middle, descriptors = in_middle_row(places, self._turn_rate, intrinsics), describe(frame.grey, places)
-        segment.add(TrackedKeyframe(frame.index, T, track_ids, middle, places, unknown, descriptors, frame.grey))
+        middle, descriptors = (
+            in_middle_row(places, self._turn_rate, intrinsics),
+            describe(frame.grey, places),
+        )
+        segment.add(
+            TrackedKeyframe(
+                frame.index, T, track_ids, middle, places, unknown, descriptors, frame.grey
+            )
+        )
         if is_tracked:
             gone = segment.adjust(intrinsics)
             segment.keyframes[-1] = segment.keyframes[-1].without(gone)
@@ -309,7 +388,9 @@ class KeyframeOdometry:
         self._slipped = np.zeros(len(self._places), np.bool_)
         self._spread = None
 
-    def _note(self, frame: int, event: Event, other: int | None = None, support: int | None = None) -> None:
+    def _note(
+        self, frame: int, event: Event, other: int | None = None, support: int | None = None
+    ) -> None:
         """Keep an event and log it."""
         self.events.append(TrackingEvent(frame, event, other, support))
         logger.info("%s", self.events[-1])
@@ -338,14 +419,20 @@ class Relocaliser:
             view = self._views[keyframe]
             pairs = np.column_stack(matches(view, image, OF_KEYFRAMES))
             pairs = pairs[np.isfinite(view.points[pairs[:, 0]]).all(axis=1)]
-            in_map = apply(self._T_map_camera[keyframe], view.points[pairs[:, 0]].astype(np.float64))
+            in_map = apply(
+                self._T_map_camera[keyframe], view.points[pairs[:, 0]].astype(np.float64)
+            )
             parts.append((np.full(len(pairs), keyframe), pairs, in_map))
         keyframes, rows, points = (np.concatenate(column) for column in zip(*parts, strict=True))
         best: Sighting | None = None
         for keyframe in np.unique(keyframes):
             here = keyframes == keyframe
-            seen = self._verifier.resect(points[here].astype(np.float32), image.pixels[rows[here, 1]])
-            if isinstance(seen, Sighting) and (best is None or len(seen.inliers) > len(best.inliers)):
+            seen = self._verifier.resect(
+                points[here].astype(np.float32), image.pixels[rows[here, 1]]
+            )
+            if isinstance(seen, Sighting) and (
+                best is None or len(seen.inliers) > len(best.inliers)
+            ):
                 best = seen
         if best is None:
             return None
@@ -359,7 +446,9 @@ class Relocaliser:
         if len(kept) < _LEAST_CONFIRMING:
             return None
         seen_by = zip(keyframes[kept].tolist(), rows[kept, 0].tolist(), strict=True)
-        tracks = np.array([self.local.keyframes[keyframe].track_ids[corner] for keyframe, corner in seen_by])
+        tracks = np.array(
+            [self.local.keyframes[keyframe].track_ids[corner] for keyframe, corner in seen_by]
+        )
         tracks, once = np.unique(tracks, return_index=True)
         place = self.local.keyframes[int(np.bincount(keyframes[kept]).argmax())].index
         return best.T_camera_points, tracks, image.pixels[rows[kept[once], 1]], place
@@ -388,7 +477,9 @@ def first_motion(
         if ahead.any():
             unit = float(np.median(depth[ahead] / triangulated[ahead]))
             at = np.where(ahead, np.clip(unit * triangulated, 0.2 * depth, 5.0 * depth), depth)
-            R = Rotation.from_matrix(motion.R_current_previous).as_matrix()  # OpenCV's are less exact
+            R = Rotation.from_matrix(
+                motion.R_current_previous
+            ).as_matrix()  # OpenCV's are less exact
             starts.append((make(R, unit * motion.direction), at))
     rows = np.arange(len(pixels))
     sightings = Sightings(
@@ -399,7 +490,10 @@ def first_motion(
         np.full(2 * len(rows), DEPTH_SIGMA),
     )
     problem = BundleAdjustment(sightings, intrinsics, np.array([False, True]))
-    solved = [problem.solve(np.stack([np.eye(4), T]), rays_before * z[:, None], *_FIRST_LIMITS) for T, z in starts]
+    solved = [
+        problem.solve(np.stack([np.eye(4), T]), rays_before * z[:, None], *_FIRST_LIMITS)
+        for T, z in starts
+    ]
     costs = np.array([adjusted.cost for adjusted in solved])
     best = solved[int(np.argmin(costs))] if costs.min() < costs[0] - _GAIN else solved[0]
     return best.T_camera_world[1], best.points[:, 2]

@@ -26,7 +26,10 @@ _RELATIVE_SIGMA = 0.02  # least translation sigma of a factor over the length of
 _ROTATION_SIGMA_DEG = 0.1  # least rotation sigma of a factor, degrees
 _LEAST_DEPTHS = 20
 _SHARED = 10  # keyframes that share an error of learned depth
-_SIGMA, _LEAST_SIGMA = 0.3, 0.05  # of the logarithm of the unit of an image's learned depth, where it is not measured
+_SIGMA, _LEAST_SIGMA = (
+    0.3,
+    0.05,
+)  # of the logarithm of the unit of an image's learned depth, where it is not measured
 _SAMPLES, _ROUNDS = 1000, 3
 _MOST_POINTS = 2000  # by which planes are compared
 _LEAST_COSINE = 0.8  # between the plane's normal and down by the cameras, which are held upright
@@ -57,7 +60,10 @@ class KeyframePoses:
         for pose in self.poses:
             one, other = (component.get(self.segments.get(frame, -1)) for frame in pose.ends)
             if one is not None and other is not None:
-                component = {number: one if joined == other else joined for number, joined in component.items()}
+                component = {
+                    number: one if joined == other else joined
+                    for number, joined in component.items()
+                }
         return {frame: component[number] for frame, number in self.segments.items()}
 
     def is_inside(self, pose: RelativePose) -> bool:
@@ -68,13 +74,21 @@ class KeyframePoses:
     @property
     def steps(self) -> set[Ends]:
         """Neighbouring frames that both lie in one connected component of maps."""
-        return {(k, k + 1) for k, number in self.component.items() if self.component.get(k + 1) == number}
+        return {
+            (k, k + 1)
+            for k, number in self.component.items()
+            if self.component.get(k + 1) == number
+        }
 
     def relates(self, first: int) -> bool:
         """Whether the frames before ``first`` and the frames from it on have poses in one map."""
         before = max((frame for frame in self.segments if frame < first), default=None)
         after = min((frame for frame in self.segments if frame >= first), default=None)
-        return before is not None and after is not None and self.segments[before] == self.segments[after]
+        return (
+            before is not None
+            and after is not None
+            and self.segments[before] == self.segments[after]
+        )
 
     def length(self, first: int, last: int) -> float | None:
         """The distance of two frames in the unit of learned depth; None where no map has both."""
@@ -106,7 +120,11 @@ def keyframe_poses(
         segments |= dict.fromkeys((frame for pose in located for frame in pose.ends), number)
         turns += [turn.scaled(1.0 / learned[number]) for turn in segment.turns]
         closing |= _loop_poses(segment, loops, intrinsics, seed)
-    outside = [turn for turn in turns if segments.get(turn.from_index, -1) != segments.get(turn.to_index, -2)]
+    outside = [
+        turn
+        for turn in turns
+        if segments.get(turn.from_index, -1) != segments.get(turn.to_index, -2)
+    ]
     _connect(segments, outside)
     poses += [turn for turn in outside if turn.from_index in segments]
     units = units_by_floor(maps, learned, seed)
@@ -126,7 +144,9 @@ def _segment_poses(segment: LocalMap, intrinsics: Intrinsics, seed: int) -> list
     place = {keyframe.index: k for k, keyframe in enumerate(keyframes)}
     poses: list[RelativePose] = []
     for before, after in pairwise(keyframes):
-        seen = _seen_from(segment, after.track_ids, after.pixels, after.T_camera_world, intrinsics, seed)
+        seen = _seen_from(
+            segment, after.track_ids, after.pixels, after.T_camera_world, intrinsics, seed
+        )
         sigmas = None if seen is None else seen[1]
         poses.append(_relative(before, after.index, after.T_camera_world, sigmas))
     T_guess = keyframes[0].T_camera_world
@@ -144,7 +164,9 @@ def _segment_poses(segment: LocalMap, intrinsics: Intrinsics, seed: int) -> list
     return poses
 
 
-def _loop_poses(local: LocalMap, loops: Sequence[Ends], intrinsics: Intrinsics, seed: int) -> dict[Ends, RelativePose]:
+def _loop_poses(
+    local: LocalMap, loops: Sequence[Ends], intrinsics: Intrinsics, seed: int
+) -> dict[Ends, RelativePose]:
     """Between keyframes of this map, their sigmas by the points that both see."""
     keyframes = {keyframe.index: keyframe for keyframe in local.keyframes}
     closing = {}
@@ -161,7 +183,12 @@ def _loop_poses(local: LocalMap, loops: Sequence[Ends], intrinsics: Intrinsics, 
 
 
 def _seen_from(
-    local: LocalMap, track_ids: TrackIds, pixels: FloatArray, T_guess: FloatArray, intrinsics: Intrinsics, seed: int
+    local: LocalMap,
+    track_ids: TrackIds,
+    pixels: FloatArray,
+    T_guess: FloatArray,
+    intrinsics: Intrinsics,
+    seed: int,
 ) -> tuple[FloatArray, FloatArray] | None:
     """``T_camera_world`` by the map's points and its sigmas ``(6,)``; None with too few inliers."""
     known = local.known(track_ids)
@@ -179,9 +206,13 @@ def _relative(
     """From a keyframe to a later camera; with few points of its own, a keyframe has the least certain sigmas."""
     T_from_to = keyframe.T_camera_world @ invert(T_camera_world)
     length = float(np.linalg.norm(T_from_to[:3, 3]))
-    floors = np.repeat([np.deg2rad(_ROTATION_SIGMA_DEG), _RELATIVE_SIGMA * max(length, _LEAST_LENGTH)], 3)
+    floors = np.repeat(
+        [np.deg2rad(_ROTATION_SIGMA_DEG), _RELATIVE_SIGMA * max(length, _LEAST_LENGTH)], 3
+    )
     by_points = 10.0 * floors if sigmas is None else sigmas
-    return RelativePose(keyframe.index, index, T_from_to, np.hypot(by_points, floors), KEYFRAME_SOURCE)
+    return RelativePose(
+        keyframe.index, index, T_from_to, np.hypot(by_points, floors), KEYFRAME_SOURCE
+    )
 
 
 def chained(poses: Sequence[RelativePose]) -> dict[int, FloatArray]:
@@ -206,13 +237,19 @@ def learned_units(local: LocalMap, carried: FloatArray) -> tuple[FloatArray, Flo
     The logarithm of the unit is a random walk with sigmas ``carried`` ``(K - 1,)`` from each keyframe to the next.
     """
     known = [ratios[ratios > 0.0] for ratios in map(local.ratios, local.keyframes)]
-    own = np.array([-float(np.median(np.log(r))) if len(r) >= _LEAST_DEPTHS else np.nan for r in known])
+    own = np.array(
+        [-float(np.median(np.log(r))) if len(r) >= _LEAST_DEPTHS else np.nan for r in known]
+    )
     if not np.isfinite(own).any():
         return np.ones(len(own)), np.ones(len(own))
     # the scatter of the units of learned depth about that of the map, by keyframes that share no error
     apart = own[_SHARED:] - own[:-_SHARED]
     apart = apart[np.isfinite(apart)]
-    usual = float(np.clip(mad_sigma(apart) / np.sqrt(2.0), _LEAST_SIGMA, _SIGMA)) if len(apart) >= _SHARED else _SIGMA
+    usual = (
+        float(np.clip(mad_sigma(apart) / np.sqrt(2.0), _LEAST_SIGMA, _SIGMA))
+        if len(apart) >= _SHARED
+        else _SIGMA
+    )
     weight = np.where(np.isfinite(own), 0.5 / _SHARED / usual**2, 0.0)
     own = np.nan_to_num(own)
     system = np.zeros((2, len(own)))
@@ -224,7 +261,9 @@ def learned_units(local: LocalMap, carried: FloatArray) -> tuple[FloatArray, Flo
     return np.exp(walk), np.exp(np.where(weight > 0.0, walk - own, 0.0))
 
 
-def units_by_floor(maps: Sequence[LocalMap], learned_units: Sequence[float], seed: int = 0) -> list[float]:
+def units_by_floor(
+    maps: Sequence[LocalMap], learned_units: Sequence[float], seed: int = 0
+) -> list[float]:
     """The units of maps, so that the camera has one height in all that see a floor; learned ones where it contradicts.
 
     ``learned_units`` are those of learned depth per unit of each map, ``seed`` is that of the planes drawn.
@@ -282,5 +321,8 @@ def height_above_floor(local: LocalMap, seed: int = 0) -> float | None:
     below = (points @ normal > (1.0 + _THICKNESS) * height).sum()
     heights_above = height - centres @ normal
     usual = float(np.median(heights_above))
-    is_level = normal @ down > _LEAST_COSINE * np.linalg.norm(down) and np.std(heights_above) < _MOST_SPREAD * usual
+    is_level = (
+        normal @ down > _LEAST_COSINE * np.linalg.norm(down)
+        and np.std(heights_above) < _MOST_SPREAD * usual
+    )
     return usual if is_level and below < _MOST_BELOW * len(floor) else None

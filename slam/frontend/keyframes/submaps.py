@@ -17,27 +17,48 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import KEYFRAME_SOURCE, Intrinsics, RelativePose
-from slam.frontend.keyframes.local_map import OUTLIER_PX, LocalMap, Parallax, TrackedFrame, TrackedKeyframe, TrackIds
+from slam.frontend.keyframes.local_map import (
+    OUTLIER_PX,
+    LocalMap,
+    Parallax,
+    TrackedFrame,
+    TrackedKeyframe,
+    TrackIds,
+)
 from slam.frontend.keyframes.relative_poses import learned_units
 from slam.geometry.multiview import MIN_POINTS
 from slam.geometry.se3 import FloatArray, apply, chain, invert
 
 _PIXEL_SIGMA = 0.5  # of a sighting, pixels
 _POINT_SIGMA = 0.005  # least relative sigma of the depth of a point
-_INDEPENDENT = 10  # points with independent errors that those of a keyframe are worth: all share its pose
+_INDEPENDENT = (
+    10  # points with independent errors that those of a keyframe are worth: all share its pose
+)
 # sigmas of the logarithm of the unit: to the keyframe from which on points have parallax, and between two of one part
 _BEGUN, _CARRIED = 0.03, 0.05
-_TURNED, _UNKNOWN = 0.05, 0.5  # the most by points without parallax, and where keyframes share few points
+_TURNED, _UNKNOWN = (
+    0.05,
+    0.5,
+)  # the most by points without parallax, and where keyframes share few points
 _DRIFT = 0.2  # of the sigma of one carry, that adds up along a map: what one keyframe lacks, the next ones see
 _LEAST_KEYFRAMES = 4  # of a part
-_IMAGE_ROTATION, _IMAGE_LENGTH = np.deg2rad(0.5), 0.03  # sigmas of a turn of the whole image, radians and depths
-_ROTATION, _LENGTH = np.deg2rad(0.1), 0.01  # least sigmas by points without parallax, radians and depths
+_IMAGE_ROTATION, _IMAGE_LENGTH = (
+    np.deg2rad(0.5),
+    0.03,
+)  # sigmas of a turn of the whole image, radians and depths
+_ROTATION, _LENGTH = (
+    np.deg2rad(0.1),
+    0.01,
+)  # least sigmas by points without parallax, radians and depths
 _DEPTH_SIGMA = 0.2  # of a length by learned depth, over it
 logger = logging.getLogger(__name__)
 
 # outliers are taken out at these multiples of their limit, from a start that is still off by the drift
 _OUTLIER_LIMITS = (4.0, 2.0, 1.0)
-_LIMITS = 20, 1e-4  # iterations of an adjustment, and the relative fall of the cost at which it ends
+_LIMITS = (
+    20,
+    1e-4,
+)  # iterations of an adjustment, and the relative fall of the cost at which it ends
 
 
 # rows of an earlier and of a later keyframe, and of the corners of both that are one point (M, 2)
@@ -51,7 +72,9 @@ def parts_of(segment: LocalMap, intrinsics: Intrinsics) -> list[LocalMap]:
     before the first part its own.
     """
     keyframes = segment.keyframes
-    shared = np.array([len(np.intersect1d(a.track_ids, b.track_ids)) for a, b in pairwise(keyframes)])
+    shared = np.array(
+        [len(np.intersect1d(a.track_ids, b.track_ids)) for a, b in pairwise(keyframes)]
+    )
     tied = shared >= MIN_POINTS
     sigmas = _sigmas(segment, intrinsics)
     along = np.minimum(sigmas, _TURNED) * np.where(sigmas < _CARRIED, _DRIFT, 1.0)
@@ -67,7 +90,11 @@ def parts_of(segment: LocalMap, intrinsics: Intrinsics) -> list[LocalMap]:
         if is_tied
     ]
     pace = float(np.median(paces)) if paces else 0.0
-    runs = [rows for n in range(number[-1] + 1) if len(rows := np.flatnonzero(number == n)) >= _LEAST_KEYFRAMES]
+    runs = [
+        rows
+        for n in range(number[-1] + 1)
+        if len(rows := np.flatnonzero(number == n)) >= _LEAST_KEYFRAMES
+    ]
     if not runs:
         return [segment]
     parts = [LocalMap([keyframes[k] for k in rows], segment.points, [], True) for rows in runs]
@@ -78,7 +105,9 @@ def parts_of(segment: LocalMap, intrinsics: Intrinsics) -> list[LocalMap]:
     for k in range(1, len(keyframes)):
         if part[k] < 0 or part[k] != part[k - 1]:
             to_next = keyframes[k].index, keyframes[k].T_camera_world
-            parts[before[k - 1]].turns.append(_turn(keyframes[k - 1], *to_next, None if tied[k - 1] else pace))
+            parts[before[k - 1]].turns.append(
+                _turn(keyframes[k - 1], *to_next, None if tied[k - 1] else pace)
+            )
     starts = np.array([keyframe.index for keyframe in keyframes])
     for frame in segment.frames:
         k = int(np.searchsorted(starts, frame.index, side="right")) - 1
@@ -99,11 +128,15 @@ def _held(segment: LocalMap, carried: FloatArray) -> LocalMap:
     steps[:, :3, 3] *= np.sqrt(units[:-1] * units[1:])[:, None]
     held = moved(segment, chain(steps), units)
     pairs = zip(held.keyframes, corrections, strict=True)
-    held.keyframes = [replace(k, learned_depth=correction * k.learned_depth) for k, correction in pairs]
+    held.keyframes = [
+        replace(k, learned_depth=correction * k.learned_depth) for k, correction in pairs
+    ]
     return held
 
 
-def _turn(keyframe: TrackedKeyframe, index: int, T_camera_world: FloatArray, pace: float | None = None) -> RelativePose:
+def _turn(
+    keyframe: TrackedKeyframe, index: int, T_camera_world: FloatArray, pace: float | None = None
+) -> RelativePose:
     """From a keyframe to a later camera in the unit of learned depth.
 
     Where no points lead there, but the whole image, it is a turn of unknown small length, whatever later adjustments
@@ -131,7 +164,12 @@ def _sigmas(local: LocalMap, intrinsics: Intrinsics) -> FloatArray:
     for keyframe in local.keyframes:
         tracks = keyframe.track_ids[local.known(keyframe.track_ids)]
         depth_sigmas = np.maximum(pixel / np.maximum(parallax.angle[tracks], 1e-6), _POINT_SIGMA)
-        sigmas.append(1.0 / np.sqrt(max(_INDEPENDENT * float((depth_sigmas**-2.0).sum()) / max(len(tracks), 1), 1e-9)))
+        sigmas.append(
+            1.0
+            / np.sqrt(
+                max(_INDEPENDENT * float((depth_sigmas**-2.0).sum()) / max(len(tracks), 1), 1e-9)
+            )
+        )
         parallax.see(keyframe.T_camera_world, tracks)
     return np.array(sigmas[1:])
 
@@ -163,10 +201,19 @@ def join(
     joined = _renumbered(united, tracks)
     everything = range(len(keyframes))
     for limit in _OUTLIER_LIMITS:
-        sightings, track_ids = joined.sightings(everything, np.isfinite(joined.points[:, 0]), intrinsics)
-        gone, _ = joined.solve(everything, 1, sightings, track_ids, intrinsics, _LIMITS, limit * OUTLIER_PX)
+        sightings, track_ids = joined.sightings(
+            everything, np.isfinite(joined.points[:, 0]), intrinsics
+        )
+        gone, _ = joined.solve(
+            everything, 1, sightings, track_ids, intrinsics, _LIMITS, limit * OUTLIER_PX
+        )
         outliers = sum(map(len, gone))
-        logger.info("all %d keyframes adjusted: %d sightings, %d outliers", len(everything), len(sightings), outliers)
+        logger.info(
+            "all %d keyframes adjusted: %d sightings, %d outliers",
+            len(everything),
+            len(sightings),
+            outliers,
+        )
     kept_ratios = []
     for earlier, later, corners in shared:
         seen = [
@@ -183,11 +230,15 @@ def moved(segment: LocalMap, T_world_camera: FloatArray, scales: FloatArray) -> 
     Points follow the first keyframe that sees them, frames the last keyframe before them.
     """
     points = np.full_like(segment.points, np.nan)
-    for keyframe, T, scale in reversed(list(zip(segment.keyframes, T_world_camera, scales, strict=True))):
+    for keyframe, T, scale in reversed(
+        list(zip(segment.keyframes, T_world_camera, scales, strict=True))
+    ):
         points_camera = apply(keyframe.T_camera_world, segment.points[keyframe.track_ids])
         points[keyframe.track_ids] = apply(T, scale * points_camera)
     T_camera_world = invert(T_world_camera)
-    keyframes = [replace(k, T_camera_world=T) for k, T in zip(segment.keyframes, T_camera_world, strict=True)]
+    keyframes = [
+        replace(k, T_camera_world=T) for k, T in zip(segment.keyframes, T_camera_world, strict=True)
+    ]
     indices = np.array([keyframe.index for keyframe in keyframes])
     frames = []
     for frame in segment.frames:
@@ -207,7 +258,10 @@ def _united(segments: Sequence[LocalMap]) -> LocalMap:
     frames: list[TrackedFrame] = []
     first = 0
     for segment in segments:
-        keyframes += [replace(keyframe, track_ids=keyframe.track_ids + first) for keyframe in segment.keyframes]
+        keyframes += [
+            replace(keyframe, track_ids=keyframe.track_ids + first)
+            for keyframe in segment.keyframes
+        ]
         frames += [replace(frame, track_ids=frame.track_ids + first) for frame in segment.frames]
         first += len(segment.points)
     points = np.concatenate([segment.points for segment in segments])
@@ -215,7 +269,9 @@ def _united(segments: Sequence[LocalMap]) -> LocalMap:
     return LocalMap(keyframes, points, frames, True, turns)
 
 
-def _merged_tracks(keyframes: Sequence[TrackedKeyframe], count: int, shared: Sequence[Shared]) -> TrackIds:
+def _merged_tracks(
+    keyframes: Sequence[TrackedKeyframe], count: int, shared: Sequence[Shared]
+) -> TrackIds:
     """For each track the first one of the same point ``(count,)``; a keyframe never sees a point twice."""
     first = np.arange(count)
     members: dict[int, list[int]] = {}

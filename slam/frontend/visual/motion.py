@@ -83,7 +83,11 @@ class Motion:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     def with_length(
-        self, length: float, relative_sigma: float, relative_correlated_sigma: float, noise: FloatArray
+        self,
+        length: float,
+        relative_sigma: float,
+        relative_correlated_sigma: float,
+        noise: FloatArray,
     ) -> RelativePose:
         """The same rotation and direction with another length, and noise besides that of the corners.
 
@@ -101,7 +105,10 @@ class Motion:
             for sigma in (relative_sigma, relative_correlated_sigma)
         )
         return replace(
-            self.relative_pose, T_from_to=T_previous_current, sigmas=sigmas, correlated_sigmas=correlated_sigmas
+            self.relative_pose,
+            T_from_to=T_previous_current,
+            sigmas=sigmas,
+            correlated_sigmas=correlated_sigmas,
         )
 
 
@@ -118,7 +125,9 @@ class RelativeRotation:
     sigmas: FloatArray
 
 
-def pose_sigmas(T_previous_current: FloatArray, of_unit_pose: FloatArray, length_relative_sigma: float) -> FloatArray:
+def pose_sigmas(
+    T_previous_current: FloatArray, of_unit_pose: FloatArray, length_relative_sigma: float
+) -> FloatArray:
     """Sigmas ``(6,)`` of a pose in the current camera, where GTSAM perturbs.
 
     By those ``of_unit_pose`` ``(6,)``, its rotation and direction in radians, and by that of its length.
@@ -126,7 +135,9 @@ def pose_sigmas(T_previous_current: FloatArray, of_unit_pose: FloatArray, length
     along = np.abs(invert(T_previous_current)[:3, 3])
     length = float(np.linalg.norm(along))
     translation = np.hypot(length * of_unit_pose[3:], length_relative_sigma * along)
-    return np.concatenate([of_unit_pose[:3], np.maximum(translation, _LEAST_RELATIVE_SIGMA * length)])
+    return np.concatenate(
+        [of_unit_pose[:3], np.maximum(translation, _LEAST_RELATIVE_SIGMA * length)]
+    )
 
 
 # every motion that image geometry measured, kept once under its two frames, in the order in which they were measured
@@ -216,7 +227,9 @@ class MotionHistory:
             return None
         usual = float(np.median(self.speeds))
         passed = seconds * (_SPEEDS + 1) / 2
-        return abs(speed - usual) < _MOST_ACCELERATION * passed + 3.0 * _LENGTH_RELATIVE_SIGMA * max(speed, usual)
+        return abs(
+            speed - usual
+        ) < _MOST_ACCELERATION * passed + 3.0 * _LENGTH_RELATIVE_SIGMA * max(speed, usual)
 
     def prior(self) -> MotionPrior:
         """The prior of the next motion; without a direction after too few steps."""
@@ -253,7 +266,10 @@ def step_noise(motions: Mapping[Ends, Motion], frames: int) -> dict[Ends, FloatA
     residual = _unexplained(neighbour_residual(values), _NEIGHBOUR_RESIDUAL_OF_NOISE * own)
     across = np.sqrt(np.maximum(1.0 - values[:, 3:] ** 2, 0.0))
     by_jitter = np.hstack(
-        [np.tile(JITTER_ROTATION * jitter, (len(values), 1)), JITTER_DIRECTION * np.linalg.norm(jitter) * across]
+        [
+            np.tile(JITTER_ROTATION * jitter, (len(values), 1)),
+            JITTER_DIRECTION * np.linalg.norm(jitter) * across,
+        ]
     )
     noise = np.hypot(by_jitter, _NEIGHBOUR * residual)
     return {ends: noise[row] for ends, row in place.items()}

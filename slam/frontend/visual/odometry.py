@@ -69,7 +69,9 @@ _LEARNED_LENGTH_RELATIVE_SIGMA = 0.05
 # least rotation sigma of a standing camera and of PnP
 _LEAST_ROTATION_SIGMA = np.deg2rad(0.01)
 _REPROJECTION_PX = 2.0  # largest reprojection error of a PnP inlier, pixels
-_ROAD_TOLERANCE = 0.2  # largest deviation of a corner on the road from the camera's height, in camera heights
+_ROAD_TOLERANCE = (
+    0.2  # largest deviation of a corner on the road from the camera's height, in camera heights
+)
 _STILL_FLOW_PX = 0.3  # median optical flow below which the camera stands still, pixels
 _MOST_STILL_FLOW_PX = 1.0  # of a corner of the world before a camera that stands still, pixels
 _MIN_PARALLAX_PX = 0.8  # least median optical flow that remains after rotation is removed, pixels
@@ -95,7 +97,9 @@ class VisualOdometry:
         """Prepare for the first frames; ``seed`` is that of RANSAC."""
         ratio = float(np.sqrt(_MOST_PIXELS / (intrinsics.width * intrinsics.height)))
         if ratio < 1.0:
-            intrinsics = intrinsics.resized(round(ratio * intrinsics.width), round(ratio * intrinsics.height))
+            intrinsics = intrinsics.resized(
+                round(ratio * intrinsics.width), round(ratio * intrinsics.height)
+            )
         self._intrinsics, self._size = intrinsics, (intrinsics.width, intrinsics.height)
         self._focal = intrinsics.fx, intrinsics.fy
         self._seed = seed
@@ -132,7 +136,9 @@ class VisualOdometry:
         last, flow = self._last, None
         # by the constant-velocity model, if the last motion ended at the earlier frame and spans as many frames
         if last is not None and last.ends == (2 * previous.index - current.index, previous.index):
-            flow = PredictedFlow.of(last.relative_pose.T_from_to, depth_previous_unscaled, self._intrinsics)
+            flow = PredictedFlow.of(
+                last.relative_pose.T_from_to, depth_previous_unscaled, self._intrinsics
+            )
         tracks = self._tracker.track(previous, current, flow, standing)
         if len(tracks) < MIN_INLIERS:
             measured: Motion | Failed = Failed(f"only {len(tracks)} corners could be tracked")
@@ -179,13 +185,18 @@ class VisualOdometry:
             tracks = find()
             if len(tracks) < MIN_INLIERS:
                 return None
-            votes, learned = np.ones(len(tracks), dtype=bool), nearest_depth(depth_first_unscaled, tracks.previous)
+            votes, learned = (
+                np.ones(len(tracks), dtype=bool),
+                nearest_depth(depth_first_unscaled, tracks.previous),
+            )
             matches = self._matches(tracks, votes, learned, None, mask, error)
             two_view = refined(matches, flow.unit_pose)
             if two_view is None or two_view.inliers.sum() < MIN_INLIERS:
                 return None
             sigmas = np.sqrt(np.diag(two_view.covariance)[:3])
-            return RelativeRotation((first.index, last.index), two_view.unit_pose.R_current_previous, sigmas)
+            return RelativeRotation(
+                (first.index, last.index), two_view.unit_pose.R_current_previous, sigmas
+            )
 
         return measure
 
@@ -198,15 +209,23 @@ class VisualOdometry:
         mask: DynamicMask,
         error: DepthError,
     ) -> Matches:
-        rays_previous, rays_current = self._intrinsics.rays(tracks.previous), self._intrinsics.rays(tracks.current)
-        depth, sigma = error.corrected(learned), np.maximum(error.sigma(learned), DEPTH_RELATIVE_SIGMA)
+        rays_previous, rays_current = (
+            self._intrinsics.rays(tracks.previous),
+            self._intrinsics.rays(tracks.current),
+        )
+        depth, sigma = (
+            error.corrected(learned),
+            np.maximum(error.sigma(learned), DEPTH_RELATIVE_SIGMA),
+        )
         on_road = np.zeros(len(tracks), dtype=bool)
         if height is not None:
             on_road = np.abs(rays_previous[:, 1] * depth / height - 1.0) < _ROAD_TOLERANCE
         weights, focal_px = mask.weights(tracks.previous), self._intrinsics.fx
         return Matches(rays_previous, rays_current, depth, sigma, on_road, weights, votes, focal_px)
 
-    def _still(self, ends: Ends, tracks: Tracks, votes: NDArray[np.bool_], depth: FloatArray) -> Motion | None:
+    def _still(
+        self, ends: Ends, tracks: Tracks, votes: NDArray[np.bool_], depth: FloatArray
+    ) -> Motion | None:
         flows = np.linalg.norm(tracks.current - tracks.previous, axis=1)
         flow = float(np.median(flows[votes]))
         if flow >= _STILL_FLOW_PX or not np.isfinite(depth).any():
@@ -216,7 +235,10 @@ class VisualOdometry:
         typical_radius_px = 0.25 * self._intrinsics.width
         translation = max(flow, 0.1) * float(np.nanmedian(depth)) / typical_radius_px
         sigmas = np.repeat([_LEAST_ROTATION_SIGMA, translation], 3)
-        return Motion(RelativePose(*ends, np.eye(4), sigmas, STILL_SOURCE), support=len(tracks) / tracks.sought)
+        return Motion(
+            RelativePose(*ends, np.eye(4), sigmas, STILL_SOURCE),
+            support=len(tracks) / tracks.sought,
+        )
 
     def _by_essential(
         self,
@@ -227,7 +249,9 @@ class VisualOdometry:
         height: float | None,
     ) -> Motion | Failed | None:
         """Rotation and direction from the essential matrix, None where it is not well conditioned."""
-        matches = self._matches(tracks, votes, learned, height, self._dynamic_mask, self.depth_error)
+        matches = self._matches(
+            tracks, votes, learned, height, self._dynamic_mask, self.depth_error
+        )
         rays_previous, rays_current = matches.rays_previous[votes], matches.rays_current[votes]
         # the translation of an essential matrix is arbitrary under pure rotation: only used with enough parallax
         R_current_previous = rotation_between(rays_previous, rays_current)
@@ -241,7 +265,9 @@ class VisualOdometry:
             two_view = estimate(corners, before, self._seed)
             if two_view is None or two_view.inliers.sum() < MIN_INLIERS:
                 return None
-            return self._triangulated(ends, seconds, tracks, corners, trusted_depth(learned, height), two_view)
+            return self._triangulated(
+                ends, seconds, tracks, corners, trusted_depth(learned, height), two_view
+            )
 
         usual = step(matches, history)
         if usual is None:
@@ -255,11 +281,17 @@ class VisualOdometry:
             if credible is None:
                 return Failed("the step contradicts the road and the steps before")
             chosen = credible
-            logger.info("geometry %d -> %d: %s", *ends, "as usual" if chosen is usual else "by corners alone")
+            logger.info(
+                "geometry %d -> %d: %s",
+                *ends,
+                "as usual" if chosen is usual else "by corners alone",
+            )
         self._learn(tracks, matches, learned, chosen, chosen.speed(height, seconds))
         return chosen.motion
 
-    def _learn(self, tracks: Tracks, matches: Matches, learned: FloatArray, step: Step, speed: float) -> None:
+    def _learn(
+        self, tracks: Tracks, matches: Matches, learned: FloatArray, step: Step, speed: float
+    ) -> None:
         """Learn from a trusted step where objects move, how the camera moves, and the error of learned depth."""
         two_view = step.two_view
         still = two_view.inliers & (matches.weights > 0.5)
@@ -270,33 +302,54 @@ class VisualOdometry:
         self._history = self._history.with_step(two_view.unit_pose, step.inlier_ratio, speed)
         length = step.motion.length_unscaled
         self.depth_error = self.depth_error.with_step(learned[still], nearness, sigma, length)
-        self.focal_length = self.focal_length.with_step(*rays, two_view.unit_pose, self._intrinsics.fx)
+        self.focal_length = self.focal_length.with_step(
+            *rays, two_view.unit_pose, self._intrinsics.fx
+        )
         self._points, self._fitted = step.points, tracks.track_ids[two_view.inliers]
 
     def _triangulated(
-        self, ends: Ends, seconds: float, tracks: Tracks, matches: Matches, depth: FloatArray, two_view: TwoViewEstimate
+        self,
+        ends: Ends,
+        seconds: float,
+        tracks: Tracks,
+        matches: Matches,
+        depth: FloatArray,
+        two_view: TwoViewEstimate,
     ) -> Step | None:
         """The step with its length by learned depth, None with too few points for that."""
         rays_previous, rays_current = matches.rays_previous, matches.rays_current
         unit_pose = two_view.unit_pose
-        parallax = parallax_px(rays_previous, rays_current, unit_pose.R_current_previous, self._focal)
+        parallax = parallax_px(
+            rays_previous, rays_current, unit_pose.R_current_previous, self._focal
+        )
         depth_previous = triangulated_depth(rays_previous, rays_current, unit_pose)
         solid = two_view.inliers & (depth_previous > 0) & (parallax > _MIN_POINT_PARALLAX_PX)
         measures = solid & np.isfinite(depth)
         if measures.sum() < _MIN_RATIOS:
             return None
         relative_sigma = INLIER_PX / np.maximum(parallax, 1e-9)
-        length, spread = self.depth_error.length(depth[measures], depth_previous[measures], relative_sigma[measures])
+        length, spread = self.depth_error.length(
+            depth[measures], depth_previous[measures], relative_sigma[measures]
+        )
         # errors of learned depth are correlated in patches: one in ten counts as independent
-        spread *= MAD_TO_SIGMA * CORNER_CORRELATION / float(np.sqrt(max(measures.sum() / 10.0, 1.0)))
-        T_previous_current = invert(make(unit_pose.R_current_previous, length * unit_pose.direction))
+        spread *= (
+            MAD_TO_SIGMA * CORNER_CORRELATION / float(np.sqrt(max(measures.sum() / 10.0, 1.0)))
+        )
+        T_previous_current = invert(
+            make(unit_pose.R_current_previous, length * unit_pose.direction)
+        )
         across = np.maximum(1.0 - unit_pose.direction**2, 0.0)
-        floors = np.concatenate([np.full(3, _ROTATION_FLOOR_DEG), _DIRECTION_FLOOR_DEG * np.sqrt(across)])
+        floors = np.concatenate(
+            [np.full(3, _ROTATION_FLOOR_DEG), _DIRECTION_FLOOR_DEG * np.sqrt(across)]
+        )
         covariance = two_view.covariance + np.diag(np.deg2rad(floors) ** 2)
         depth_current = depth_in_current(rays_previous, depth_previous, unit_pose)
         solid &= depth_current > 0
         triangulated = TriangulatedPoints(
-            tracks.track_ids[solid], depth_previous[solid], depth_current[solid], relative_sigma[solid]
+            tracks.track_ids[solid],
+            depth_previous[solid],
+            depth_current[solid],
+            relative_sigma[solid],
         )
         last, earlier = self._last, self._points
         is_next = last is not None and last.is_triangulated and last.ends[1] == ends[0]
@@ -304,10 +357,14 @@ class VisualOdometry:
         relative = max(spread, _LEARNED_LENGTH_RELATIVE_SIGMA)
         sigmas = pose_sigmas(T_previous_current, np.sqrt(np.diag(covariance)), relative)
         pose = RelativePose(*ends, T_previous_current, sigmas, ESSENTIAL_SOURCE)
-        motion = Motion(pose, covariance, ratio, seconds, float(two_view.inliers.sum()) / tracks.sought)
+        motion = Motion(
+            pose, covariance, ratio, seconds, float(two_view.inliers.sum()) / tracks.sought
+        )
         return Step(motion, two_view, triangulated)
 
-    def _by_points(self, ends: Ends, tracks: Tracks, votes: NDArray[np.bool_], depth: FloatArray) -> Motion | Failed:
+    def _by_points(
+        self, ends: Ends, tracks: Tracks, votes: NDArray[np.bool_], depth: FloatArray
+    ) -> Motion | Failed:
         """Perspective-n-point of the later image's corners on the earlier frame's learned depth."""
         known = np.isfinite(depth) & votes
         if known.sum() < MIN_INLIERS:
@@ -315,7 +372,9 @@ class VisualOdometry:
         corrected = self.depth_error.corrected(depth[known])
         points_previous = self._intrinsics.rays(tracks.previous[known]) * corrected[:, None]
         pixels, K = tracks.current[known], self._intrinsics.K
-        T_start, inliers = consensus(points_previous, pixels, K, _PNP_ITERATIONS, _REPROJECTION_PX, self._seed)
+        T_start, inliers = consensus(
+            points_previous, pixels, K, _PNP_ITERATIONS, _REPROJECTION_PX, self._seed
+        )
         count = len(inliers)
         if count < max(MIN_INLIERS, _LEAST_PNP_SHARE * len(pixels)):
             known_corners = f"{count} of {len(pixels)} corners"
@@ -333,10 +392,16 @@ class VisualOdometry:
         """The frame with an image of at most a megapixel."""
 
         def reduced() -> Frame:
-            image: Image = np.asarray(cv2.resize(frame.image, self._size, interpolation=cv2.INTER_AREA), np.uint8)
+            image: Image = np.asarray(
+                cv2.resize(frame.image, self._size, interpolation=cv2.INTER_AREA), np.uint8
+            )
             return Frame(frame.index, frame.stamp, image)
 
-        return frame if frame.image.shape[1::-1] == self._size else frame.derived(("reduced", self._size), reduced)
+        return (
+            frame
+            if frame.image.shape[1::-1] == self._size
+            else frame.derived(("reduced", self._size), reduced)
+        )
 
     def _reduced_depth(self, depth: DepthMap) -> DepthMap:
         """The depth map ``(h, w)`` of the reduced image."""
@@ -360,7 +425,9 @@ class TriangulatedPoints:
 
         In the frame between, a point's depth is ``|t| z`` by either step; None with too few common points.
         """
-        _, first, second = np.intersect1d(earlier.track_ids, self.track_ids, assume_unique=True, return_indices=True)
+        _, first, second = np.intersect1d(
+            earlier.track_ids, self.track_ids, assume_unique=True, return_indices=True
+        )
         if len(first) < _LEAST_COMMON:
             return None
         logarithms = np.log(earlier.depth_current[first] / self.depth_previous[second])
@@ -405,7 +472,11 @@ def most_credible(
         is_possible = history.is_possible_speed(speed, seconds)
         votes = [] if is_possible is None else [is_possible]
         # points of this step and the one before have the ratio of lengths that learned depth has
-        if step.motion.length_ratio is not None and history.speeds and np.isfinite(speed / history.speeds[-1]):
+        if (
+            step.motion.length_ratio is not None
+            and history.speeds
+            and np.isfinite(speed / history.speeds[-1])
+        ):
             ratio, _ = step.motion.length_ratio
             votes.append(bool(abs(np.log(speed / history.speeds[-1]) - ratio) < _AGREEMENT))
         # the corners on the road are triangulated at the camera's height below it

@@ -38,7 +38,9 @@ _USUAL_SIGMA = 0.15
 _USUAL_FAR_SIGMA = 0.25
 _FOCAL_STEP = 0.01  # of the logarithm, for its derivative
 _LEAST_SIGMA_PX = 1e-3
-_CORRELATION = 4.0  # of the errors of corners, and of those that flow makes where a camera hardly turns
+_CORRELATION = (
+    4.0  # of the errors of corners, and of those that flow makes where a camera hardly turns
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,9 +60,13 @@ class DepthError:
 
     def sigma(self, depth: FloatArray) -> FloatArray:
         """Relative sigma of learned depth of any shape, without its bias."""
-        return np.asarray(np.interp(np.log(np.where(depth > 0, depth, 1.0)), np.log(_DEPTHS), self._spread))
+        return np.asarray(
+            np.interp(np.log(np.where(depth > 0, depth, 1.0)), np.log(_DEPTHS), self._spread)
+        )
 
-    def length(self, learned: FloatArray, triangulated: FloatArray, relative_sigma: FloatArray) -> tuple[float, float]:
+    def length(
+        self, learned: FloatArray, triangulated: FloatArray, relative_sigma: FloatArray
+    ) -> tuple[float, float]:
         """Length of a motion in the unit of learned depth, and the relative spread of single corners about it.
 
         Args:
@@ -73,7 +79,9 @@ class DepthError:
         centre = weighted_median(logarithms, weights)
         return float(np.exp(centre)), weighted_median(np.abs(logarithms - centre), weights)
 
-    def with_step(self, learned: FloatArray, nearness: FloatArray, sigma: FloatArray, length: float) -> Self:
+    def with_step(
+        self, learned: FloatArray, nearness: FloatArray, sigma: FloatArray, length: float
+    ) -> Self:
         """The error after one more step.
 
         Args:
@@ -88,7 +96,9 @@ class DepthError:
         weights = 1.0 / (1.0 + (spread / _USUAL_SIGMA) ** 2)
         corners, noise = _KEPT * self.corners, _KEPT * self.noise
         depths = _nearest(np.log2(learned[known]), np.log2(_DEPTHS))
-        np.add.at(corners, (depths, _nearest(np.log(np.maximum(ratio, 1e-9)), _LOGARITHMS)), weights)
+        np.add.at(
+            corners, (depths, _nearest(np.log(np.maximum(ratio, 1e-9)), _LOGARITHMS)), weights
+        )
         np.add.at(noise, depths, weights * spread)
         return type(self)(corners, noise)
 
@@ -107,7 +117,9 @@ class DepthError:
         """Learned depth, its bias (logarithm), its relative sigma and the corners seen there, where there are many."""
         corners = self.corners.sum(axis=1)
         rows = zip(_DEPTHS, self.bias, self._spread, corners, strict=True)
-        return [(float(d), float(b), float(s), float(n)) for d, b, s, n in rows if n > _PRIOR_CORNERS]
+        return [
+            (float(d), float(b), float(s), float(n)) for d, b, s, n in rows if n > _PRIOR_CORNERS
+        ]
 
     @cached_property
     def bias(self) -> FloatArray:
@@ -165,7 +177,11 @@ class FocalLength:
         return -self.gradient / self.information, _CORRELATION / float(np.sqrt(self.information))
 
     def with_step(
-        self, rays_previous: FloatArray, rays_current: FloatArray, unit_pose: UnitRelativePose, focal_px: float
+        self,
+        rays_previous: FloatArray,
+        rays_current: FloatArray,
+        unit_pose: UnitRelativePose,
+        focal_px: float,
     ) -> Self:
         """After one more step, whose rotation and direction are eliminated.
 
@@ -175,7 +191,9 @@ class FocalLength:
 
         def across(ratio: float) -> tuple[FloatArray, FloatArray]:
             scale = np.array([1.0 / ratio, 1.0 / ratio, 1.0])
-            residuals = Residuals(rays_previous * scale, rays_current * scale, unknown, focal_px * ratio)
+            residuals = Residuals(
+                rays_previous * scale, rays_current * scale, unknown, focal_px * ratio
+            )
             return residuals.across(unit_pose, tangent)
 
         residual, by_motion = across(1.0)

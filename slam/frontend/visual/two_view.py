@@ -57,10 +57,15 @@ _EARLY_EXIT_INLIER_RATIO = 0.75  # inlier ratio at which RANSAC stops early
 INLIER_PX = 0.6  # largest epipolar distance of an inlier, pixels
 DEPTH_RELATIVE_SIGMA = 0.2  # least relative sigma of learned depth along an epipolar line
 # hat(w) row by row, by each component of w
-_HATS = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], float)
+_HATS = np.array(
+    [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]],
+    float,
+)
 _CELL_PX = 8.0
 _SPREAD_CELLS = 1.5
-_SHARPNESS = 4.0  # power of a cell's inlier ratio over that of the whole image, by which corners weigh
+_SHARPNESS = (
+    4.0  # power of a cell's inlier ratio over that of the whole image, by which corners weigh
+)
 # decay a step: a half-life of seven steps
 _KEPT = 0.9
 # weight, in corners, of the prior that a cell has the inlier ratio of the whole image
@@ -171,7 +176,9 @@ def refined(matches: Matches, start: UnitRelativePose) -> TwoViewEstimate | None
     return _refined(matches, start, MotionPrior(start.direction, AXIS_SIGMA))
 
 
-def _refined(matches: Matches, start: UnitRelativePose | None, prior: MotionPrior) -> TwoViewEstimate | None:
+def _refined(
+    matches: Matches, start: UnitRelativePose | None, prior: MotionPrior
+) -> TwoViewEstimate | None:
     """Gauss-Newton with Cauchy weights over rotation, direction and the length in the unit of learned depth.
 
     Across its epipolar line a corner has the noise of the image, along it that of learned depth. A corner with
@@ -197,13 +204,17 @@ def _refined(matches: Matches, start: UnitRelativePose | None, prior: MotionPrio
         if inliers.sum() < _LEAST_POINTS:
             return None
         weights = inliers * matches.weights / (1.0 + (across / (2.0 * sigma)) ** 2)
-        weights_along = known * weights / (sigma_along**2 * (1.0 + (along / (2.0 * sigma_along)) ** 2))
+        weights_along = (
+            known * weights / (sigma_along**2 * (1.0 + (along / (2.0 * sigma_along)) ** 2))
+        )
         weights = weights / sigma**2
         normal = (weights_along * by_all) @ by_all.T + 1e-9 * np.eye(6)
         normal[:5, :5] += (weights * by_motion) @ by_motion.T
         gradient = by_all @ (weights_along * along)
         gradient[:5] += by_motion @ (weights * across)
-        deviation = unit_pose.direction - np.copysign(1.0, prior.axis @ unit_pose.direction) * prior.axis
+        deviation = (
+            unit_pose.direction - np.copysign(1.0, prior.axis @ unit_pose.direction) * prior.axis
+        )
         normal[3:5, 3:5] += np.eye(2) / prior.axis_sigma**2
         gradient[3:5] += tangent.T @ deviation / prior.axis_sigma**2
         step = np.asarray(-_OVERSTEP * np.linalg.solve(normal, gradient), np.float64)
@@ -220,7 +231,11 @@ def _refined(matches: Matches, start: UnitRelativePose | None, prior: MotionPrio
 
 
 def _inliers(
-    matches: Matches, near: NDArray[np.bool_], shift_px: FloatArray, seen_px: FloatArray, parallax_px: float
+    matches: Matches,
+    near: NDArray[np.bool_],
+    shift_px: FloatArray,
+    seen_px: FloatArray,
+    parallax_px: float,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which corners near their epipolar lines fit learned depth ``(M,)``, and which are inliers ``(M,)``.
 
@@ -231,7 +246,11 @@ def _inliers(
     """
     known = np.isfinite(matches.depth_previous)
     measured = near & known & (seen_px > 1.0) & (shift_px > 0)
-    by_parallax = weighted_median(seen_px[measured] / shift_px[measured], seen_px[measured]) if measured.any() else 1.0
+    by_parallax = (
+        weighted_median(seen_px[measured] / shift_px[measured], seen_px[measured])
+        if measured.any()
+        else 1.0
+    )
     expected_px = by_parallax * shift_px
     tolerance_px = _ALONG_SIGMAS * np.hypot(_ALONG_PX, matches.depth_sigma * expected_px)
     agreeing = near & (~known | (np.abs(seen_px - expected_px) < tolerance_px))
@@ -246,7 +265,9 @@ def _with_first_sigma(matches: Matches, motions: Sequence[UnitRelativePose | Non
     ratios = [matches.ratios(motion)[0] for motion in motions if motion is not None]
     least = max(_LEAST_POINTS, _COMPARABLE_SUPPORT * max(map(len, ratios), default=0))
     logarithms = [np.log(of_motion) for of_motion in ratios if len(of_motion) >= least]
-    error = min((mad_sigma(logarithm - np.median(logarithm)) for logarithm in logarithms), default=0.0)
+    error = min(
+        (mad_sigma(logarithm - np.median(logarithm)) for logarithm in logarithms), default=0.0
+    )
     return replace(matches, depth_sigma=np.maximum(matches.depth_sigma, error))
 
 
@@ -264,7 +285,11 @@ class Residuals:
     """
 
     def __init__(
-        self, rays_previous: FloatArray, rays_current: FloatArray, depth_previous: FloatArray, focal_px: float
+        self,
+        rays_previous: FloatArray,
+        rays_current: FloatArray,
+        depth_previous: FloatArray,
+        focal_px: float,
     ) -> None:
         """From rays ``(M, 3)`` with z = 1, and learned depths ``(M,)`` in the earlier camera or NaN."""
         self._previous = np.ascontiguousarray(rays_previous.T)
@@ -276,7 +301,9 @@ class Residuals:
         self._inverse_depth = np.where(np.isfinite(depth_previous), 1.0 / depth_previous, 0.0)
         self._focal_px = focal_px
 
-    def across(self, unit_pose: UnitRelativePose, tangent: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def across(
+        self, unit_pose: UnitRelativePose, tangent: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Sampson distances ``(M,)`` and their derivatives ``(5, M)`` (Hartley and Zisserman 2004, Eq. 11.9).
 
         The gradient's norm changes with the motion too. Held fixed, as reweighted least squares do, it biases the
@@ -307,7 +334,9 @@ class Residuals:
         Also their derivatives ``(6, M)``, and the shift along the line predicted by learned depth ``(M,)``.
         """
         rotated = unit_pose.R_current_previous @ self._previous
-        points = rotated + (length * unit_pose.direction)[:, None] * self._inverse_depth  # over depth
+        points = (
+            rotated + (length * unit_pose.direction)[:, None] * self._inverse_depth
+        )  # over depth
         ahead = np.maximum(points[2], 1e-6)
         expected = points[:2] / ahead
         line = expected - rotated[:2] / np.maximum(rotated[2], 1e-6)
@@ -354,9 +383,13 @@ class DynamicMask:
         if self.corners.sum() < 1.0:
             return np.ones(len(pixels))
         usual = self.inliers.sum() / self.corners.sum()
-        inliers, corners = (cv2.GaussianBlur(kind, (0, 0), _SPREAD_CELLS) for kind in (self.inliers, self.corners))
+        inliers, corners = (
+            cv2.GaussianBlur(kind, (0, 0), _SPREAD_CELLS) for kind in (self.inliers, self.corners)
+        )
         ratio = (inliers + _PRIOR_CORNERS * usual) / (corners + _PRIOR_CORNERS)
-        return np.asarray(np.minimum(ratio[self._cells(pixels)] / max(usual, 1e-3), 1.0) ** _SHARPNESS)
+        return np.asarray(
+            np.minimum(ratio[self._cells(pixels)] / max(usual, 1e-3), 1.0) ** _SHARPNESS
+        )
 
     def updated(self, pixels: FloatArray, is_inlier: NDArray[np.bool_]) -> Self:
         """The mask after one more step, whose corners now lie at ``pixels`` ``(M, 2)``."""
@@ -393,7 +426,9 @@ def moving_corners(
     moving = np.zeros(len(pixels), dtype=bool)
     if not contradicting.any():
         return moving
-    cells = np.floor((pixels[contradicting] - pixels[contradicting].min(axis=0)) / _REGION_CELL_PX).astype(np.int64)
+    cells = np.floor(
+        (pixels[contradicting] - pixels[contradicting].min(axis=0)) / _REGION_CELL_PX
+    ).astype(np.int64)
     occupied = np.zeros(tuple(cells.max(axis=0) + 1), np.uint8)
     occupied[tuple(cells.T)] = 1
     count, labels = cv2.connectedComponents(occupied, connectivity=8)
@@ -413,5 +448,7 @@ def _medians(values: FloatArray, groups: NDArray[np.integer[Any]], count: int) -
     """The median of the values ``(K,)`` of each group, ``(count,)``; 0 of an empty one."""
     order, sizes = np.lexsort((values, groups)), np.bincount(groups, minlength=count)
     first, last = np.cumsum(sizes) - sizes, len(values) - 1
-    below, above = (np.minimum(first + np.maximum(half, 0), last) for half in ((sizes - 1) // 2, sizes // 2))
+    below, above = (
+        np.minimum(first + np.maximum(half, 0), last) for half in ((sizes - 1) // 2, sizes // 2)
+    )
     return np.where(sizes > 0, 0.5 * (values[order[below]] + values[order[above]]), 0.0)

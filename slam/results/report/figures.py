@@ -26,8 +26,17 @@ from slam.runtime.errors import RunError
 from slam.runtime.files import MAP_MESH, REFERENCE
 from slam.runtime.imports import import_open3d
 
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito (2008): for every eye
-LOOKS: dict[str, tuple[str, str | None, float, str]] = {  # label, colour (None: that of text), width, dash
+COLOURS = (
+    "#0072b2",
+    "#d55e00",
+    "#009e73",
+    "#cc79a7",
+    "#e69f00",
+    "#56b4e9",
+)  # Okabe and Ito (2008): for every eye
+LOOKS: dict[
+    str, tuple[str, str | None, float, str]
+] = {  # label, colour (None: that of text), width, dash
     REFERENCE: ("Ground truth", None, 1.2, "dash"),
     "network": ("Network, chained", "#e69f00", 1.3, "solid"),
     "odometry": ("Odometry", "#cc79a7", 1.5, "dashdot"),
@@ -59,9 +68,18 @@ def trajectories_figure(
         figure.add_trace(_line(name, x, z, _frames(trajectory, trajectories), where))
     if loops and "optimised" in trajectories:
         at = trajectories["optimised"].positions[[loop.to for loop in loops]]
-        text = [f"loop: frame {loop.to} is where frame {loop.from_} was, {loop.reason}" for loop in loops]
+        text = [
+            f"loop: frame {loop.to} is where frame {loop.from_} was, {loop.reason}"
+            for loop in loops
+        ]
         marker = {"symbol": "circle-open", "size": 9, "color": COLOURS[1]}
-        look = {"mode": "markers", "name": "Loops", "marker": marker, "text": text, "hoverinfo": "text"}
+        look = {
+            "mode": "markers",
+            "name": "Loops",
+            "marker": marker,
+            "text": text,
+            "hoverinfo": "text",
+        }
         figure.add_trace(go.Scatter(x=_single(at[:, 0]), y=_single(at[:, 2]), **look))
     figure.update_xaxes(title=f"x, right ({unit})")
     figure.update_yaxes(title=f"z, ahead ({unit})", scaleanchor="x")
@@ -84,7 +102,9 @@ def map_figure(view: MapView) -> go.Figure:
         )
     )
     line = {"color": COLOURS[0], "width": 4}
-    figure.add_scatter3d(**_by_axis("xyz", map(_single, path.T)), mode="lines", line=line, hoverinfo="skip")
+    figure.add_scatter3d(
+        **_by_axis("xyz", map(_single, path.T)), mode="lines", line=line, hoverinfo="skip"
+    )
     # a unit of the scene is what is near, for it is clipped at a hundredth of one
     low, high = (f([f(points, axis=0), f(path, axis=0)], axis=0) for f in (np.min, np.max))
     size = np.maximum(high - low, 1e-3)
@@ -96,14 +116,17 @@ def map_figure(view: MapView) -> go.Figure:
     )
     scene |= {
         "camera": {
-            name: _by_axis("xyz", ((X - 0.5 * (low + high)) / view.ahead).tolist()) for name, X in places.items()
+            name: _by_axis("xyz", ((X - 0.5 * (low + high)) / view.ahead).tolist())
+            for name, X in places.items()
         },
         "aspectratio": _by_axis("xyz", (size / view.ahead).tolist()),
         "aspectmode": "manual",
         "dragmode": "turntable",
         "bgcolor": _SKY,
     }
-    return figure.update_layout(scene=scene, height=_MAP, showlegend=False, margin={"l": 0, "r": 0, "t": 0, "b": 0})
+    return figure.update_layout(
+        scene=scene, height=_MAP, showlegend=False, margin={"l": 0, "r": 0, "t": 0, "b": 0}
+    )
 
 
 def error_figure(trajectories: Mapping[str, Trajectory]) -> go.Figure:
@@ -134,24 +157,40 @@ def drift_figure(trajectories: Mapping[str, Trajectory]) -> go.Figure:
     return figure.update_yaxes(rangemode="tozero")
 
 
-def scale_figure(trajectories: Mapping[str, Trajectory], is_metric: bool, gaps: Iterable[Stretch]) -> go.Figure:
+def scale_figure(
+    trajectories: Mapping[str, Trajectory], is_metric: bool, gaps: Iterable[Stretch]
+) -> go.Figure:
     """Lengths over the true ones, and the error of the rotation, over time; gaps are shaded.
 
     Where lengths are metric those of all but the network are taken as written, else after the 7-dof alignment.
     """
-    figure, reference = _panels("length / true length", "rotation error (deg)"), trajectories[REFERENCE]
+    figure, reference = (
+        _panels("length / true length", "rotation error (deg)"),
+        trajectories[REFERENCE],
+    )
     for name, estimate, truth in paired(trajectories):
-        measured = associate(trajectories[name], reference)[0] if is_metric and name != "network" else estimate
+        measured = (
+            associate(trajectories[name], reference)[0]
+            if is_metric and name != "network"
+            else estimate
+        )
         frames, seconds = _frames(truth, trajectories), truth.stamps - reference.stamps[0]
-        true_path, path = path_distance(truth.T_world_camera), path_distance(measured.T_world_camera)
+        true_path, path = (
+            path_distance(truth.T_world_camera),
+            path_distance(measured.T_world_camera),
+        )
         ends = np.searchsorted(true_path, true_path + true_path[-1] / _STRETCHES)
         starts = np.flatnonzero(ends < len(path))
         ends = ends[starts]
         true_length = true_path[ends] - true_path[starts]
         ratio = (path[ends] - path[starts]) / np.where(true_length > 0, true_length, np.nan)
         middle = (starts + ends) // 2
-        figure.add_trace(_line(name, seconds[middle], ratio, frames[middle], "%{y:.3f} at %{x:.1f} s"), 1, 1)
-        turned = np.swapaxes(truth.T_world_camera[:, :3, :3], 1, 2) @ estimate.T_world_camera[:, :3, :3]
+        figure.add_trace(
+            _line(name, seconds[middle], ratio, frames[middle], "%{y:.3f} at %{x:.1f} s"), 1, 1
+        )
+        turned = (
+            np.swapaxes(truth.T_world_camera[:, :3, :3], 1, 2) @ estimate.T_world_camera[:, :3, :3]
+        )
         off = np.rad2deg(rotation_angle(turned))
         line = _line(name, seconds, off, frames, "%{y:.2f} deg at %{x:.1f} s", showlegend=False)
         figure.add_trace(line, 2, 1)
@@ -159,30 +198,51 @@ def scale_figure(trajectories: Mapping[str, Trajectory], is_metric: bool, gaps: 
     return _over_time(figure, reference, gaps)
 
 
-def motion_figure(trajectories: Mapping[str, Trajectory], unit: str, gaps: Iterable[Stretch]) -> go.Figure:
+def motion_figure(
+    trajectories: Mapping[str, Trajectory], unit: str, gaps: Iterable[Stretch]
+) -> go.Figure:
     """Speed, and angles of the optimised trajectory, over time: what shows of scale and rotation without truth."""
     figure, drawn = _panels(f"speed ({unit} / s)", "angles (deg)"), aligned(trajectories)
     last = drawn.get("optimised") or next(iter(drawn.values()))
     for name, trajectory in drawn.items():
-        steps, seconds = np.diff(trajectory.positions, axis=0), trajectory.stamps[1:] - last.stamps[0]
+        steps, seconds = (
+            np.diff(trajectory.positions, axis=0),
+            trajectory.stamps[1:] - last.stamps[0],
+        )
         speed = np.linalg.norm(steps, axis=1) / np.maximum(np.diff(trajectory.stamps), 1e-9)
         frames = _frames(trajectory, drawn)[1:]
         figure.add_trace(_line(name, seconds, speed, frames, "%{y:.3f} at %{x:.1f} s"), 1, 1)
     angles = np.unwrap(Rotation.from_matrix(last.T_world_camera[:, :3, :3]).as_euler("YXZ"), axis=0)
     for name, colour, values in zip(("Yaw", "Pitch", "Roll"), COLOURS[1:], np.rad2deg(angles).T):
         words = f"frame %{{customdata}}: {name} %{{y:.2f}} deg at %{{x:.1f}} s<extra></extra>"
-        line = {"name": name, "line": {"color": colour, "width": 1.6}, "hovertemplate": words, "mode": "lines"}
+        line = {
+            "name": name,
+            "line": {"color": colour, "width": 1.6},
+            "hovertemplate": words,
+            "mode": "lines",
+        }
         frames, seconds = _frames(last, drawn), last.stamps - last.stamps[0]
-        figure.add_trace(go.Scatter(x=_single(seconds), y=_single(values), customdata=frames, **line), 2, 1)
+        figure.add_trace(
+            go.Scatter(x=_single(seconds), y=_single(values), customdata=frames, **line), 2, 1
+        )
     return _over_time(figure, last, gaps)
 
 
-def _line(name: str, x: FloatArray, y: FloatArray, frames: Any, words: str, **more: Any) -> go.Scatter:
+def _line(
+    name: str, x: FloatArray, y: FloatArray, frames: Any, words: str, **more: Any
+) -> go.Scatter:
     """A line of a trajectory, which tells the frame under the pointer."""
     label, colour, width, dash = LOOKS.get(name, (name, None, 1.8, "solid"))
     line = {"width": width, "dash": dash} | ({} if colour is None else {"color": colour})
     words = f"{'' if frames is None else 'frame %{customdata}: '}{words}<extra>{label}</extra>"
-    given = {"mode": "lines", "customdata": frames, "line": line, "name": label, "legendgroup": name, **more}
+    given = {
+        "mode": "lines",
+        "customdata": frames,
+        "line": line,
+        "name": label,
+        "legendgroup": name,
+        **more,
+    }
     return go.Scatter(x=_single(x), y=_single(y), hovertemplate=words, **given)
 
 
@@ -203,7 +263,9 @@ def _panels(*titles: str) -> go.Figure:
 def _over_time(figure: go.Figure, trajectory: Trajectory, gaps: Iterable[Stretch]) -> go.Figure:
     for gap in gaps:
         ends = trajectory.stamps[[max(gap.first - 1, 0), min(gap.last + 1, len(trajectory) - 1)]]
-        figure.add_vrect(*(ends - trajectory.stamps[0]), fillcolor="#8b949e", opacity=0.25, line_width=0)
+        figure.add_vrect(
+            *(ends - trajectory.stamps[0]), fillcolor="#8b949e", opacity=0.25, line_width=0
+        )
     return figure.update_xaxes(title="time (s)", row=2)
 
 
@@ -245,7 +307,9 @@ def map_view(folder: RunFolder, triangles: int = _TRIANGLES) -> MapView | None:
         return None
     mesh = thinned_mesh(folder.path / MAP_MESH, triangles)
     poses = trajectory.T_world_camera
-    frames = np.unique(np.linspace(0, len(poses) - 1, _CANDIDATES + 2)[1:-1].round().astype(int)).tolist()
+    frames = np.unique(
+        np.linspace(0, len(poses) - 1, _CANDIDATES + 2)[1:-1].round().astype(int)
+    ).tolist()
     depths = [_depths(mesh.points, poses[frame]) for frame in frames]
     best = int(np.argmax([np.count_nonzero(z < _SEEN_WITHIN) for z in depths]))
     ahead = float(np.percentile(depths[best], _NEAR_PERCENT)) if len(depths[best]) else _SEEN_WITHIN
@@ -258,11 +322,17 @@ def thinned_mesh(path: Path, triangles: int) -> MapMesh:
     if not mesh.has_triangles():
         raise RunError(f"{path} is no mesh that can be read: run the sequence again")
     if len(mesh.triangles) > max(_MOST_TRIANGLES, _FINER * triangles):
-        mesh = mesh.simplify_vertex_clustering(_COARSER * np.sqrt(2.0 * mesh.get_surface_area() / (_FINER * triangles)))
+        mesh = mesh.simplify_vertex_clustering(
+            _COARSER * np.sqrt(2.0 * mesh.get_surface_area() / (_FINER * triangles))
+        )
     if len(mesh.triangles) > triangles:
         mesh = mesh.simplify_quadric_decimation(triangles)
         mesh = mesh.remove_degenerate_triangles().remove_unreferenced_vertices()
-    colours = np.asarray(mesh.vertex_colors) if mesh.has_vertex_colors() else np.full_like(mesh.vertices, 0.5)
+    colours = (
+        np.asarray(mesh.vertex_colors)
+        if mesh.has_vertex_colors()
+        else np.full_like(mesh.vertices, 0.5)
+    )
     rgb = np.rint(255.0 * np.clip(colours, 0.0, 1.0)).astype(np.uint8)
     return MapMesh(np.asarray(mesh.vertices), rgb, np.asarray(mesh.triangles).astype(np.int64))
 

@@ -79,7 +79,11 @@ def write_report(
     no_errors, optimised = missing_errors(errors), metrics.trajectories.optimised
     found = {name: folder.trajectory(name) for name in (REFERENCE, *TRAJECTORIES)}
     drawn = {name: trajectory for name, trajectory in found.items() if trajectory is not None}
-    accepted = LoopsFile.read(folder.path / LOOPS).accepted or [] if (folder.path / LOOPS).is_file() else []
+    accepted = (
+        LoopsFile.read(folder.path / LOOPS).accepted or []
+        if (folder.path / LOOPS).is_file()
+        else []
+    )
     no_map = "" if metrics.map.triangles is not None else metrics.map.why("triangles")
     page = _TEMPLATES.get_template("page.html.j2").render(
         script=(files("slam.results.report") / "page.js").read_text("utf-8"),
@@ -106,16 +110,23 @@ def _absence(metrics: Metrics, reason: str) -> str:
 
 
 def _plots(
-    metrics: Metrics, trajectories: Mapping[str, Trajectory], loops: Sequence[AcceptedLoop], view: MapView | None
+    metrics: Metrics,
+    trajectories: Mapping[str, Trajectory],
+    loops: Sequence[AcceptedLoop],
+    view: MapView | None,
 ) -> dict[str, list[Picture]]:
     """The plots of every section; one that cannot be drawn (trajectories without common stamps) has the reason."""
     from slam.results.report import figures
 
     found: dict[str, list[Picture]] = {"trajectories": [], "errors": [], "map": []}
 
-    def add(section: str, title: str, caption: str, draw: Callable[..., Figure], *given: Any) -> None:
+    def add(
+        section: str, title: str, caption: str, draw: Callable[..., Figure], *given: Any
+    ) -> None:
         try:
-            figure = draw(*given).update_layout(template={})  # page.js draws it in the colours of the page
+            figure = draw(*given).update_layout(
+                template={}
+            )  # page.js draws it in the colours of the page
             plot = str(figure.to_json()).replace("<", "\\u003c")
             found[section].append(Picture(title, caption, plot=plot))
         except SlamError as error:
@@ -129,18 +140,46 @@ def _plots(
         caption = _ALIGNED if has_truth else _AS_WRITTEN
         add("trajectories", "Trajectories from above", caption, figures.trajectories_figure, *given)
     if has_truth:
-        how = "as written, the network after the 7-dof alignment" if metrics.is_metric else "after the 7-dof alignment"
+        how = (
+            "as written, the network after the 7-dof alignment"
+            if metrics.is_metric
+            else "after the 7-dof alignment"
+        )
         caption = f"Lengths of stretches of 1/25 of the path, {how}; rotation after it. Interpolated frames are shaded."
         title = "Scale and rotation over time"
-        add("trajectories", title, caption, figures.scale_figure, trajectories, metrics.is_metric, gaps)
+        add(
+            "trajectories",
+            title,
+            caption,
+            figures.scale_figure,
+            trajectories,
+            metrics.is_metric,
+            gaps,
+        )
         caption = "Distance to the true position, after the 7-dof alignment."
         add("errors", "Position error along the path", caption, figures.error_figure, trajectories)
         if metrics.trajectories.optimised.align.dof7.t_rel_percent is not None:
             caption = "Mean relative error of all segments of a length; the scale is that of the 7-dof alignment."
-            add("errors", "Drift by the length of segments", caption, figures.drift_figure, trajectories)
+            add(
+                "errors",
+                "Drift by the length of segments",
+                caption,
+                figures.drift_figure,
+                trajectories,
+            )
     elif trajectories:
-        caption = "Speed, and the angles of the optimised trajectory. Interpolated frames are shaded."
-        add("trajectories", "Speed and rotation over time", caption, figures.motion_figure, trajectories, unit, gaps)
+        caption = (
+            "Speed, and the angles of the optimised trajectory. Interpolated frames are shaded."
+        )
+        add(
+            "trajectories",
+            "Speed and rotation over time",
+            caption,
+            figures.motion_figure,
+            trajectories,
+            unit,
+            gaps,
+        )
     if view is not None:
         caption = (
             f"The map, thinned, and the camera's path, seen first from its place at frame {view.frame}. "
@@ -181,11 +220,15 @@ class DepthPictures:
             learned = each.depth if each.network_depth is None else each.network_depth
             depths = [learned] if each.relative_sigma is None else [learned, each.depth]
             strip = np.hstack([each.image, colour_disparity(np.hstack(depths))])
-            found.append(_picture(narrowed(strip, _WIDTH_PX * (1 + len(depths))), f"Frame {each.frame}"))
+            found.append(
+                _picture(narrowed(strip, _WIDTH_PX * (1 + len(depths))), f"Frame {each.frame}")
+            )
         return found
 
 
-def loop_pictures(loops: Sequence[Loop], image: Callable[[int], Image | None], intrinsics: Intrinsics) -> list[Picture]:
+def loop_pictures(
+    loops: Sequence[Loop], image: Callable[[int], Image | None], intrinsics: Intrinsics
+) -> list[Picture]:
     """Some accepted loops, spread over the drive: both images with lines between the corners that measured the loop.
 
     Loops of which an image is None, as those of a live drive are, are left out; ``intrinsics`` are of the recording,
@@ -199,7 +242,11 @@ def loop_pictures(loops: Sequence[Loop], image: Callable[[int], Image | None], i
             first, second = (image(index) for index in best.ends)
             if first is not None and second is not None:
                 title = f"Frames {best.ends[0]} and {best.ends[1]}: {best.inliers} inliers"
-                found.append(_picture(_joined(first, second, best.pixels * (_WIDTH_PX / intrinsics.width)), title))
+                found.append(
+                    _picture(
+                        _joined(first, second, best.pixels * (_WIDTH_PX / intrinsics.width)), title
+                    )
+                )
     return found
 
 
@@ -224,4 +271,8 @@ def narrowed(image: Image, width: int) -> Image:
 
 def _picture(image: Image, title: str) -> Picture:
     _, content = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 82])
-    return Picture(title, title, f"data:image/jpeg;base64,{base64.b64encode(content.tobytes()).decode('ascii')}")
+    return Picture(
+        title,
+        title,
+        f"data:image/jpeg;base64,{base64.b64encode(content.tobytes()).decode('ascii')}",
+    )

@@ -43,10 +43,15 @@ def write_rerun(path: Path, result: Estimate, intrinsics: Intrinsics) -> None:
             pose = rr.Transform3D(translation=T_world_camera[:3, 3], mat3x3=T_world_camera[:3, :3])
             stream.log("world/camera", pose)
             if index in keyframes:
-                depth = np.nan_to_num(keyframes[index].depth_unscaled * np.float32(result.scale.per_frame[index]))
+                depth = np.nan_to_num(
+                    keyframes[index].depth_unscaled * np.float32(result.scale.per_frame[index])
+                )
                 height, width = depth.shape
                 K = intrinsics.resized(width, height).K
-                stream.log("world/camera/image", rr.Pinhole(image_from_camera=K, width=width, height=height))
+                stream.log(
+                    "world/camera/image",
+                    rr.Pinhole(image_from_camera=K, width=width, height=height),
+                )
                 image = rr.Image(keyframes[index].image).compress(jpeg_quality=_JPEG_QUALITY)
                 stream.log("world/camera/image", image)
                 stream.log("world/camera/image/depth", rr.DepthImage(depth, meter=1.0))

@@ -22,7 +22,9 @@ def outcome(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
     def run(does: Callable[[list[str]], object], *words: str) -> tuple[int, str]:
         monkeypatch.setattr(sys, "argv", ["program", *words])
         with pytest.raises(SystemExit) as stopped:
-            command_line.run(lambda args, prog_name: sys.exit(does(args)), "program", logging.WARNING)
+            command_line.run(
+                lambda args, prog_name: sys.exit(does(args)), "program", logging.WARNING
+            )
         return int(stopped.value.code or 0), capsys.readouterr().err
 
     return run
@@ -32,7 +34,9 @@ def test_a_warning_that_repeats_is_said_once() -> None:
     program = "import logging\nfrom erfsfm.common import command_line\n"
     program += "def app(args, prog_name):\n for k in range(111): logging.getLogger('images').warning('image %d', k)\n"
     program += " raise OSError('the error')\ncommand_line.run(app, 'program', logging.WARNING)"
-    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False).stderr
+    said = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    ).stderr
     assert said.splitlines() == ["WARNING images: image 0", "program: the error"]
 
 
@@ -49,8 +53,14 @@ def raising(error: Exception) -> Callable[[object], object]:
         (DataError("two\nlines"), "program: two lines"),
         (FileNotFoundError(2, "No such file", "a"), "program: a: No such file: check the path"),
         (MemoryError(), "program: memory ran out"),
-        (RuntimeError("DefaultCPUAllocator: can't allocate memory: not enough memory"), "program: memory ran out"),
-        (ZeroDivisionError("by zero"), "program: unexpected ZeroDivisionError: by zero (test_command_line.py:"),
+        (
+            RuntimeError("DefaultCPUAllocator: can't allocate memory: not enough memory"),
+            "program: memory ran out",
+        ),
+        (
+            ZeroDivisionError("by zero"),
+            "program: unexpected ZeroDivisionError: by zero (test_command_line.py:",
+        ),
     ],
 )
 def test_every_error_is_one_line(outcome: Outcome, error: Exception, line: str) -> None:

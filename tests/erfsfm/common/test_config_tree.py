@@ -66,7 +66,8 @@ def test_files_and_overrides(tmp_path: Path) -> None:
 def test_an_unknown_key_is_one_line(tmp_path: Path, text: str) -> None:
     key = "flow.side" if text.startswith("flow") else "bridging"
     assert re.search(
-        rf"unknown key '{key}.*' in --set {re.escape(text)}; (known keys|did you mean)", refusal(None, text)
+        rf"unknown key '{key}.*' in --set {re.escape(text)}; (known keys|did you mean)",
+        refusal(None, text),
     )
     path = tmp_path / "a.yaml"
     path.write_text("flow: {side: 3}")
@@ -78,10 +79,14 @@ def test_an_error_names_its_origin(tmp_path: Path) -> None:
     path.write_text("flow: {window_px: x}")
     assert "a.yaml should be a valid integer" in refusal(path)
     path.write_text("{}")
-    assert "'flow.window_px' in --set flow.window_px=x should be" in refusal(path, "flow.window_px=x")
+    assert "'flow.window_px' in --set flow.window_px=x should be" in refusal(
+        path, "flow.window_px=x"
+    )
     assert "in --set flow.window_px.x=3 should be" in refusal(path, "flow.window_px.x=3")
     assert "in --set flow={window_px: x} should be" in refusal(path, "flow={window_px: x}")
-    assert len(refusal(path, f"flow.window_px=[{'1,' * 5000}]")) < 10_500  # of which the override itself is most
+    assert (
+        len(refusal(path, f"flow.window_px=[{'1,' * 5000}]")) < 10_500
+    )  # of which the override itself is most
 
 
 def test_both_dumps_read_back() -> None:

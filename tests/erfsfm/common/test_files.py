@@ -12,7 +12,13 @@ import pytest
 from matplotlib.figure import Figure
 
 from erfsfm.common.errors import BusyError, ConfigError
-from erfsfm.common.files import FIGURE_SUFFIXES, FolderLock, read_bytes, save_figure, write_atomically
+from erfsfm.common.files import (
+    FIGURE_SUFFIXES,
+    FolderLock,
+    read_bytes,
+    save_figure,
+    write_atomically,
+)
 
 
 def test_a_pipe_or_a_device_keeps_its_place(tmp_path: Path) -> None:
@@ -32,12 +38,16 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", FIGURE_SUFFIXES)
-def test_a_figure_replaces_a_figure_and_equal_ones_are_equal_files(tmp_path: Path, suffix: str) -> None:
+def test_a_figure_replaces_a_figure_and_equal_ones_are_equal_files(
+    tmp_path: Path, suffix: str
+) -> None:
     path, contents = tmp_path / f"figure{suffix}", []
     for _ in range(2):
         save_figure(Figure(), path, dpi=50)
         contents.append(path.read_bytes())
-    assert contents[0] == contents[1] or suffix == ".svg"  # its ids are random without the style of our plots
+    assert (
+        contents[0] == contents[1] or suffix == ".svg"
+    )  # its ids are random without the style of our plots
 
 
 def test_another_image_stays(tmp_path: Path) -> None:
@@ -45,7 +55,8 @@ def test_another_image_stays(tmp_path: Path) -> None:
     cv2.imwrite(str(image), np.zeros((4, 4, 3), np.uint8))
     before = image.read_bytes()
     with pytest.raises(
-        ConfigError, match=r"000000\.png is none of ours and would be replaced: choose another --output"
+        ConfigError,
+        match=r"000000\.png is none of ours and would be replaced: choose another --output",
     ):
         save_figure(Figure(), image, dpi=50)
     assert image.read_bytes() == before
@@ -54,7 +65,10 @@ def test_another_image_stays(tmp_path: Path) -> None:
 def test_a_folder_is_held_until_the_end_of_the_block(tmp_path: Path) -> None:
     with FolderLock() as lock:
         lock.take(tmp_path / "run")
-        with FolderLock() as other, pytest.raises(BusyError, match=r"another process writes to .*run: wait"):
+        with (
+            FolderLock() as other,
+            pytest.raises(BusyError, match=r"another process writes to .*run: wait"),
+        ):
             other.take(tmp_path / "run")
     with FolderLock() as lock:
         lock.take(tmp_path / "run")

@@ -21,10 +21,14 @@ def test_thread_counts_are_limited_and_restored_also_after_an_error() -> None:
     try:
         with pytest.raises(ZeroDivisionError), limit_library_threads():
             assert cv2.getNumThreads() == 1
-            assert all(pool["num_threads"] == 1 for pool in threadpool_info() if pool["user_api"] == "blas")
+            assert all(
+                pool["num_threads"] == 1 for pool in threadpool_info() if pool["user_api"] == "blas"
+            )
             _ = 1 / 0
         assert cv2.getNumThreads() == 3
-        assert [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"] == blas
+        assert [
+            pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"
+        ] == blas
     finally:
         cv2.setNumThreads(before)
 
@@ -41,7 +45,9 @@ def test_one_process_of_many_starts_no_threads() -> None:
     )
     threads = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
     free = {name: value for name, value in os.environ.items() if name not in threads}
-    done = subprocess.run([sys.executable, "-c", program], env=free, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=free, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
 
 

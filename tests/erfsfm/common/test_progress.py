@@ -23,7 +23,9 @@ def test_lines_say_what_is_done_and_the_time_left() -> None:
     assert re.fullmatch(r"frames, 2: 2 of 100, 0 min 1\d s left", lines[1])
 
 
-@pytest.mark.parametrize(("seconds", "words"), [(68, "1 min 8 s"), (9000, "2 h 30 min"), (432_000, "5.0 days")])
+@pytest.mark.parametrize(
+    ("seconds", "words"), [(68, "1 min 8 s"), (9000, "2 h 30 min"), (432_000, "5.0 days")]
+)
 def test_long_times_are_said_in_hours_and_days(seconds: int, words: str) -> None:
     assert duration(seconds) == words
 

@@ -13,12 +13,17 @@ from erfsfm.common.signals import Terminated, raising_on_termination
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_a_signal_raises_with_its_name_and_code_until_it_is_ignored(name: str) -> None:
     number = getattr(signal, name)
-    with pytest.raises(Terminated, match=f"ended by {name}") as raised, raising_on_termination() as ignore:
+    with (
+        pytest.raises(Terminated, match=f"ended by {name}") as raised,
+        raising_on_termination() as ignore,
+    ):
         try:
             os.kill(os.getpid(), number)
         finally:
             ignore()
-            os.kill(os.getpid(), number)  # sent twice: the second one must not stop the writing of what there is
+            os.kill(
+                os.getpid(), number
+            )  # sent twice: the second one must not stop the writing of what there is
     assert raised.value.code == 128 + number
     assert signal.getsignal(number) is signal.SIG_DFL
 

@@ -20,12 +20,21 @@ def test_on_a_terminal_nothing_is_marked_up_or_cut(capsys: pytest.CaptureFixture
 
 
 def test_markdown_sets_numbers_to_the_right() -> None:
-    assert TABLE.markdown().splitlines() == ["| name | length m |", "|---|---:|", "| a [b] <c> | 1.50 |", "| d | – |"]
+    assert TABLE.markdown().splitlines() == [
+        "| name | length m |",
+        "|---|---:|",
+        "| a [b] <c> | 1.50 |",
+        "| d | – |",
+    ]
 
 
 def test_html_is_escaped() -> None:
     text = TABLE.html()
-    assert "<h3>one &amp; two</h3>" in text and "<td>a [b] &lt;c&gt;</td>" in text and "length<br>m" in text
+    assert (
+        "<h3>one &amp; two</h3>" in text
+        and "<td>a [b] &lt;c&gt;</td>" in text
+        and "length<br>m" in text
+    )
 
 
 def test_records_become_a_table_and_csv() -> None:

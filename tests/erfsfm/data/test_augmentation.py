@@ -35,10 +35,14 @@ def centre_of(image: NDArray[np.uint8]) -> NDArray[np.float64]:
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("flip", [0.0, 1.0])
 @pytest.mark.parametrize("zoom", [1.0, 1.15, 1.3])
-def test_points_project_to_where_the_augmented_image_has_them(seed: int, flip: float, zoom: float) -> None:
+def test_points_project_to_where_the_augmented_image_has_them(
+    seed: int, flip: float, zoom: float
+) -> None:
     images = [blob(project(CAMERA, point)) for point in POINTS]
     config = DataConfig(flip=flip, zoom=zoom)
-    varied, _, camera, _ = augment(images, [], CAMERA, config, "default", np.random.default_rng(seed))
+    varied, _, camera, _ = augment(
+        images, [], CAMERA, config, "default", np.random.default_rng(seed)
+    )
     assert (camera.width, camera.height) == (160, 96)
     for image, point in zip(varied, POINTS):
         assert image.shape == (96, 160, 3)
@@ -52,7 +56,9 @@ def test_maps_move_with_the_images(seed: int) -> None:
     image = blob(project(CAMERA, POINTS[0]))
     values = image[..., 0].astype(np.float32)
     config = DataConfig(flip=0.5, zoom=1.3)
-    (varied,), (moved,), _, _ = augment([image], [values], CAMERA, config, "default", np.random.default_rng(seed))
+    (varied,), (moved,), _, _ = augment(
+        [image], [values], CAMERA, config, "default", np.random.default_rng(seed)
+    )
     assert set(np.unique(moved)) <= set(np.unique(values))  # never mixed
     v, u = np.mgrid[:96, :160]
     centre = np.array([(u * moved).sum(), (v * moved).sum()]) / moved.sum()
@@ -61,27 +67,40 @@ def test_maps_move_with_the_images(seed: int) -> None:
 
 def test_a_rolled_camera_sees_points_where_it_should_at_the_same_depth() -> None:
     angle = np.deg2rad(3)
-    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    turn = np.array(
+        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+    )
     for point in POINTS:
         depth = np.full((CAMERA.height, CAMERA.width), point[2], np.float32)
         image, (turned,) = rolled(blob(project(CAMERA, point)), [depth], CAMERA, angle, (0,))
         np.testing.assert_allclose(centre_of(image), project(CAMERA, turn @ point), atol=0.2)
-        assert set(np.unique(turned)) == {np.float32(0), np.float32(point[2])}, "unknown beyond the edges"
+        assert set(np.unique(turned)) == {np.float32(0), np.float32(point[2])}, (
+            "unknown beyond the edges"
+        )
 
 
 def test_the_papers_flip_is_one_pixel_off() -> None:
     images = [blob(project(CAMERA, POINTS[0]))]
-    varied, _, camera, _ = augment(images, [], CAMERA, DataConfig(flip=1, zoom=1), "paper", np.random.default_rng(0))
-    assert project(camera, POINTS[0] * [-1, 1, 1])[0] - centre_of(varied[0])[0] == pytest.approx(1, abs=0.05)
+    varied, _, camera, _ = augment(
+        images, [], CAMERA, DataConfig(flip=1, zoom=1), "paper", np.random.default_rng(0)
+    )
+    assert project(camera, POINTS[0] * [-1, 1, 1])[0] - centre_of(varied[0])[0] == pytest.approx(
+        1, abs=0.05
+    )
 
 
 def test_the_papers_zoom_multiplies_the_camera_before_sizes_are_rounded() -> None:
     images = [np.zeros((96, 160, 3), np.uint8)]
-    _, _, camera, _ = augment(images, [], CAMERA, DataConfig(flip=0, zoom=1.15), "paper", np.random.default_rng(7))
+    _, _, camera, _ = augment(
+        images, [], CAMERA, DataConfig(flip=0, zoom=1.15), "paper", np.random.default_rng(7)
+    )
     rng = np.random.default_rng(7)
     rng.random()
     zoom_x, zoom_y = rng.uniform(1, 1.15, 2)
-    left, top = (int(rng.integers(int(side * zoom) - side + 1)) for side, zoom in ((160, zoom_x), (96, zoom_y)))
+    left, top = (
+        int(rng.integers(int(side * zoom) - side + 1))
+        for side, zoom in ((160, zoom_x), (96, zoom_y))
+    )
     assert left > 0 and top > 0
     assert (camera.fx, camera.cx) == (110 * zoom_x, 77 * zoom_x - left)
     assert (camera.fy, camera.cy) == (120 * zoom_y, 50 * zoom_y - top)
@@ -127,7 +146,11 @@ def test_images_stay_images_and_many_get_worse(images: list[NDArray[np.uint8]]) 
 
 def test_positions_do_not_change(images: list[NDArray[np.uint8]]) -> None:
     """The mean over much weather has its brightest place where the clear image has it."""
-    seen = [image.astype(float)[..., 0] for s in range(60) for image in weathered(images, np.random.default_rng(s))]
+    seen = [
+        image.astype(float)[..., 0]
+        for s in range(60)
+        for image in weathered(images, np.random.default_rng(s))
+    ]
     bright = np.maximum(np.mean(seen, axis=0) - 90, 0)
     v, u = np.mgrid[:64, :160]
     assert (u * bright).sum() / bright.sum() == pytest.approx(79.5, abs=1.5)

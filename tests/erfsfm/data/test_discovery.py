@@ -18,7 +18,9 @@ from erfsfm.data.recordings import Recording
 CAMERA = {"width": 48, "height": 32, "fx": 40.0, "fy": 41.0, "cx": 23.5, "cy": 15.5, "fps": 10}
 
 
-def write_images(folder: Path, count: int = 3, size: tuple[int, int] = (32, 48), suffix: str = ".png") -> Path:
+def write_images(
+    folder: Path, count: int = 3, size: tuple[int, int] = (32, 48), suffix: str = ".png"
+) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     for index in range(count):
         image = np.zeros((*size, 3), np.uint8)
@@ -57,11 +59,20 @@ def test_kitti_root(tmp_path: Path, write_root: Callable[..., Path], prefix: str
     assert [r.name for r in recordings] == ["kitti_odometry/00", "kitti_odometry/09"]
     assert [len(r) for r in recordings] == [4, 4]
     camera = recordings[0].camera
-    assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (96, 64, 60, 62, 47.5, 31.5)
+    assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (
+        96,
+        64,
+        60,
+        62,
+        47.5,
+        31.5,
+    )
     assert isinstance(camera.fx, float)
 
 
-def test_simulated_root_is_named_by_its_seed(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+def test_simulated_root_is_named_by_its_seed(
+    tmp_path: Path, write_root: Callable[..., Path]
+) -> None:
     write_root(tmp_path, frames=3, seed=17, depth=True)
     recording = one(tmp_path)
     assert recording.name == "simulated/17"
@@ -88,7 +99,9 @@ def test_poses_and_parts(tmp_path: Path, write_root: Callable[..., Path]) -> Non
     assert len(whole.part(4, 10**9)) == 2
 
 
-def test_poses_are_those_of_the_camera_that_took_the_images(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+def test_poses_are_those_of_the_camera_that_took_the_images(
+    tmp_path: Path, write_root: Callable[..., Path]
+) -> None:
     """P2 with 60 px * 0.5 m in its last column: camera 2 is half a metre left of camera 0, which rotates left."""
     write_root(tmp_path, frames=2)
     (tmp_path / "sequences/00/calib.txt").write_text("P2: 60 0 47.5 30 0 62 31.5 0 0 0 1 0\n")
@@ -153,7 +166,10 @@ def test_a_recording_is_split_at_its_gaps(
     for number in (0, 3, 4):
         (tmp_path / f"sequences/00/image_2/{number:06d}.png").unlink()
     first, second = discover(tmp_path)
-    assert (first.frames_name, second.frames_name) == ("kitti_odometry/00[1:3]", "kitti_odometry/00[5:9]")
+    assert (first.frames_name, second.frames_name) == (
+        "kitti_odometry/00[1:3]",
+        "kitti_odometry/00[5:9]",
+    )
     assert "2 of 8 frames have no image; the first gap is 000003.png to 000004.png" in caplog.text
     for recording, places in ((first, [0.5, 1.0]), (second, [2.5, 3.0, 3.5, 4.0])):
         T_world_camera, depth = recording.true_poses(), recording.true_depth(1)
@@ -169,20 +185,29 @@ NAME = "kitti_raw/2011_09_26_drive_0001"
 
 
 @pytest.mark.parametrize("place", ["", "2011_09_26", "2011_09_26/2011_09_26_drive_0001_sync"])
-def test_root_may_be_a_date_or_a_drive(tmp_path: Path, write_raw: Callable[..., Path], place: str) -> None:
+def test_root_may_be_a_date_or_a_drive(
+    tmp_path: Path, write_raw: Callable[..., Path], place: str
+) -> None:
     write_raw(tmp_path / "raw")
     left, right = discover(tmp_path / "raw" / place)
     assert left.frames_name == right.frames_name == f"{NAME}[0:6]"
-    assert [recording.images[0].parts[-3] for recording in (left, right)] == ["image_02", "image_03"]
+    assert [recording.images[0].parts[-3] for recording in (left, right)] == [
+        "image_02",
+        "image_03",
+    ]
 
 
 def test_every_drive_of_every_date(tmp_path: Path, write_raw: Callable[..., Path]) -> None:
     for drive in ("2011_10_03_drive_0047", "2011_09_26_drive_0005", "2011_09_26_drive_0002"):
         write_raw(tmp_path, drive=drive, frames=1)
-    (tmp_path / "2011_09_26/2011_09_26_drive_0009_sync/oxts").mkdir(parents=True)  # downloaded in part
+    (tmp_path / "2011_09_26/2011_09_26_drive_0009_sync/oxts").mkdir(
+        parents=True
+    )  # downloaded in part
     names = [recording.name.removeprefix("kitti_raw/") for recording in discover(tmp_path)]
     assert names == [
-        name for name in ("2011_09_26_drive_0002", "2011_09_26_drive_0005", "2011_10_03_drive_0047") for _ in range(2)
+        name
+        for name in ("2011_09_26_drive_0002", "2011_09_26_drive_0005", "2011_10_03_drive_0047")
+        for _ in range(2)
     ]
 
 
@@ -196,7 +221,9 @@ def test_intrinsics_follow_the_stored_size(tmp_path: Path, write_raw: Callable[.
     assert right.camera.cx == 46, "each camera has its own row"
 
 
-def test_grey_cameras_where_there_is_no_colour(tmp_path: Path, write_raw: Callable[..., Path]) -> None:
+def test_grey_cameras_where_there_is_no_colour(
+    tmp_path: Path, write_raw: Callable[..., Path]
+) -> None:
     drive = write_raw(tmp_path)
     shutil.copytree(drive / "image_02", drive / "image_00")
     for camera in ("image_02", "image_03"):
@@ -205,7 +232,9 @@ def test_grey_cameras_where_there_is_no_colour(tmp_path: Path, write_raw: Callab
     assert recording.images[0].parts[-3] == "image_00"
 
 
-def test_parts_keep_the_numbers_of_the_drive(tmp_path: Path, write_raw: Callable[..., Path]) -> None:
+def test_parts_keep_the_numbers_of_the_drive(
+    tmp_path: Path, write_raw: Callable[..., Path]
+) -> None:
     drive = write_raw(tmp_path, speeds=[9.0] * 6)
     for camera in ("image_02", "image_03"):
         for number in (0, 3):

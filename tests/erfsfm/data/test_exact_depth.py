@@ -36,21 +36,46 @@ SIZE = (64, 96)
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("exact") / "world"
-    write_kitti_root(SimulatedStreet(SimulationOptions("straight", 6, 1, 96, 64, varied=True)), folder, depth=True)
+    write_kitti_root(
+        SimulatedStreet(SimulationOptions("straight", 6, 1, 96, 64, varied=True)),
+        folder,
+        depth=True,
+    )
     return folder
 
 
 @pytest.fixture
-def mixed(world: Path, write_root: Callable[..., Path], tmp_path: Path) -> Callable[..., ExperimentConfig]:
+def mixed(
+    world: Path, write_root: Callable[..., Path], tmp_path: Path
+) -> Callable[..., ExperimentConfig]:
     """An experiment on the world and a real drive, half exact."""
     real = write_root(tmp_path / "real", 12)
 
     def build(roots: tuple[Path, ...] = (world, real), **data: Any) -> ExperimentConfig:
         sections: dict[str, Any] = {
-            "network": {"height": SIZE[0], "width": SIZE[1], "sources": 2, "depth_width": 0.1, "pose_width": 0.1},
-            "data": {"workers": 0, "flip": 0, "zoom": 1, "exact": 0.5, "validation": [], "roots": list(roots)} | data,
+            "network": {
+                "height": SIZE[0],
+                "width": SIZE[1],
+                "sources": 2,
+                "depth_width": 0.1,
+                "pose_width": 0.1,
+            },
+            "data": {
+                "workers": 0,
+                "flip": 0,
+                "zoom": 1,
+                "exact": 0.5,
+                "validation": [],
+                "roots": list(roots),
+            }
+            | data,
             "loss": {"smoothness": "disparity-edge-aware", "smoothness_weight": 0.001},
-            "teacher": {"views": "many", "structure_weight": 1, "edge_weight": 1, "cache": tmp_path / "measured"},
+            "teacher": {
+                "views": "many",
+                "structure_weight": 1,
+                "edge_weight": 1,
+                "cache": tmp_path / "measured",
+            },
             "training": {"networks": "depth", "batch": 4, "steps": 1},
         }
         return ExperimentConfig.model_validate(sections)
@@ -75,7 +100,9 @@ def test_the_label_is_the_inverse_depth_in_camera_heights(
     teacher = ManyViewTeacher(config.teacher.cache, SIZE, config.teacher.stride)  # type: ignore[arg-type]
     sample = SnippetDraws(recordings, config, 8, many_views=teacher).draw(0)
     recording = next(each for each in recordings if each.exact)
-    height_m = SimulatedStreet(SimulationOptions("straight", 6, 1, 96, 64, varied=True)).camera_height_m
+    height_m = SimulatedStreet(
+        SimulationOptions("straight", 6, 1, 96, 64, varied=True)
+    ).camera_height_m
     assert recording.camera_height_m == pytest.approx(height_m)
     images = [recording.image(index, *SIZE) for index in range(len(recording))]
     shown = sample["target"].permute(1, 2, 0).numpy()
@@ -83,7 +110,9 @@ def test_the_label_is_the_inverse_depth_in_camera_heights(
     depth_m = recording.true_depth(index)
     assert depth_m is not None
     nearer = recording.camera.fy / SIZE[0] / FOCAL_LENGTH
-    wanted = torch.from_numpy(height_m / np.where(depth_m > 0, depth_m, FARTHEST_M) * nearer).float()
+    wanted = torch.from_numpy(
+        height_m / np.where(depth_m > 0, depth_m, FARTHEST_M) * nearer
+    ).float()
     torch.testing.assert_close(sample["most"][0], wanted)
     known = torch.from_numpy(depth_m > 0)
     torch.testing.assert_close(sample["least"][0], torch.where(known, wanted, 0))
@@ -111,18 +140,27 @@ def test_a_prepared_folder_trains_without_the_worlds(
     measure(config, lambda *_: 0.25)
     prepare(config, tmp_path / "prepared")
     original, again = (
-        SnippetDraws(split_recordings(c.data)[0], c, 4) for c in (config, mixed((tmp_path / "prepared",)))
+        SnippetDraws(split_recordings(c.data)[0], c, 4)
+        for c in (config, mixed((tmp_path / "prepared",)))
     )
     for number in range(2):
         one, other = original.draw(number), again.draw(number)
-        torch.testing.assert_close(other["least"], one["least"], msg="exact depth of the same pixels")
+        torch.testing.assert_close(
+            other["least"], one["least"], msg="exact depth of the same pixels"
+        )
     train(mixed((tmp_path / "prepared",)), tmp_path / "run", device="cpu")
-    assert read_record(tmp_path / "run" / "model.yaml").trained_on == ["simulated/1", "kitti_odometry/00[0:12]"]
+    assert read_record(tmp_path / "run" / "model.yaml").trained_on == [
+        "simulated/1",
+        "kitti_odometry/00[0:12]",
+    ]
 
 
 @pytest.mark.parametrize("where", [".", "images"])
 def test_a_depth_camera_is_exact_and_what_it_does_not_see_may_be_anywhere(
-    mixed: Callable[..., ExperimentConfig], tmp_path: Path, caplog: pytest.LogCaptureFixture, where: str
+    mixed: Callable[..., ExperimentConfig],
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    where: str,
 ) -> None:
     folder = tmp_path / "office"
     (folder / "depth").mkdir(parents=True)
@@ -130,7 +168,9 @@ def test_a_depth_camera_is_exact_and_what_it_does_not_see_may_be_anywhere(
     depth = np.full((64, 96), 2000, np.uint16)  # millimetres
     depth[:32] = 0
     for index in range(6):
-        cv2.imwrite(str(folder / "images" / f"{index:06d}.png"), np.full((64, 96, 3), 30 * index, np.uint8))
+        cv2.imwrite(
+            str(folder / "images" / f"{index:06d}.png"), np.full((64, 96, 3), 30 * index, np.uint8)
+        )
         cv2.imwrite(str(folder / "depth" / f"{index:06d}.png"), depth)
     camera = "width: 96\nheight: 64\nfx: 90\nfy: 90\ncx: 48\ncy: 32\nfps: 5\n"
     (folder / where / "camera.yaml").write_text(camera)
@@ -139,17 +179,23 @@ def test_a_depth_camera_is_exact_and_what_it_does_not_see_may_be_anywhere(
     (folder / where / "camera.yaml").write_text(camera + "depth_per_metre: 1000\n")
     config = mixed((folder, tmp_path / "real"), weights={"folder": 1, "kitti": 1})
     recordings, _ = split_recordings(config.data)
-    draws = SnippetDraws(recordings, config, 8, imitated=lambda image: np.ones(image.shape[:2], np.float32))
+    draws = SnippetDraws(
+        recordings, config, 8, imitated=lambda image: np.ones(image.shape[:2], np.float32)
+    )
     sample = draws.draw(0)
     nearer = 90 / SIZE[0] / FOCAL_LENGTH
     assert torch.isinf(sample["most"][0, :32]).all()
-    torch.testing.assert_close(sample["least"][0, 32:], torch.full((32, 96), INDOOR_HEIGHT_M / 2 * nearer))
+    torch.testing.assert_close(
+        sample["least"][0, 32:], torch.full((32, 96), INDOOR_HEIGHT_M / 2 * nearer)
+    )
     (folder / "depth" / "000003.png").unlink()
     assert not discover(folder)[0].exact
     assert "000003.png" in caplog.text
 
 
-def test_worlds_are_drawn_by_their_weight(world: Path, mixed: Callable[..., ExperimentConfig]) -> None:
+def test_worlds_are_drawn_by_their_weight(
+    world: Path, mixed: Callable[..., ExperimentConfig]
+) -> None:
     (recording,) = discover(world)
     twice = [recording, replace(recording, name="folder/office")]
     np.testing.assert_allclose(chances(twice, [1, 1], {"simulated": 9, "folder": 1}), [0.9, 0.1])

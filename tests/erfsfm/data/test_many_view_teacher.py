@@ -21,7 +21,9 @@ SIZE = (64, 208)
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Recording:
     root = tmp_path_factory.mktemp("world")
-    write_kitti_root(SimulatedStreet(SimulationOptions("straight", 20, 704, 312, 96)), root / "world", depth=True)
+    write_kitti_root(
+        SimulatedStreet(SimulationOptions("straight", 20, 704, 312, 96)), root / "world", depth=True
+    )
     return discover(root / "world")[0]
 
 
@@ -49,7 +51,10 @@ def test_the_slam_system_gives_the_motion_in_camera_heights(recording, tmp_path)
     length_m = np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum()
     length = np.linalg.norm(np.diff(estimate[:, :3, 3], axis=0), axis=1).sum()
     assert length_m / length == pytest.approx(1.65, rel=0.1)
-    with pytest.raises(TrainingError, match=r"poses of simulated/704\[0:20\] by the weights 'sim', and .* 'default'"):
+    with pytest.raises(
+        TrainingError,
+        match=r"poses of simulated/704\[0:20\] by the weights 'sim', and .* 'default'",
+    ):
         teacher.prepare([recording], 4, "default", lambda *_: None)
 
 
@@ -91,7 +96,9 @@ def test_labels_are_made_again_when_an_image_changed(recording, tmp_path):
     assert folder() != first
 
 
-def test_an_image_that_cannot_be_read_has_no_label_and_is_no_neighbour(recording, teacher, tmp_path):
+def test_an_image_that_cannot_be_read_has_no_label_and_is_no_neighbour(
+    recording, teacher, tmp_path
+):
     shutil.copytree(recording.images[0].parents[3], tmp_path / "world")
     broken = discover(tmp_path / "world")[0]
     broken.images[12].write_bytes(b"broken")
@@ -103,7 +110,9 @@ def test_an_image_that_cannot_be_read_has_no_label_and_is_no_neighbour(recording
     assert (drive.label(10)[0] > 0).mean() > 0.3
 
 
-def test_learned_depth_is_refined_around_a_frame_at_the_size_of_the_labels(recording, teacher, tmp_path):
+def test_learned_depth_is_refined_around_a_frame_at_the_size_of_the_labels(
+    recording, teacher, tmp_path
+):
     asked = []
 
     def learned(image):
@@ -120,13 +129,17 @@ def test_learned_depth_is_refined_around_a_frame_at_the_size_of_the_labels(recor
     both = narrow & (true > 0)
     assert both.mean() > 0.3
     ratio = np.sqrt(least[both] * most[both]) * true[both] / 1.65
-    assert abs(np.median(ratio) - 1) < 0.1 and np.median(np.abs(ratio / np.median(ratio) - 1)) < 0.06
+    assert (
+        abs(np.median(ratio) - 1) < 0.1 and np.median(np.abs(ratio / np.median(ratio) - 1)) < 0.06
+    )
 
 
 @pytest.mark.slow
 def test_a_drive_that_the_slam_system_cannot_follow_is_one_line(recording, tmp_path):
     short = recording.part(0, 3)
-    with pytest.raises(TrainingError, match=r"poses of simulated/704\[0:3\] could not be found: .*3 frames"):
+    with pytest.raises(
+        TrainingError, match=r"poses of simulated/704\[0:3\] could not be found: .*3 frames"
+    ):
         ManyViewTeacher(Path(tmp_path), SIZE, stride=1).prepare([short], 2, "sim", lambda *_: None)
 
 
@@ -136,7 +149,9 @@ def test_a_drive_that_the_slam_system_cannot_follow_is_one_line(recording, tmp_p
 def measured(sigma: float) -> tuple[np.ndarray, np.ndarray]:
     """A road that comes nearer towards the lower edge."""
     inverse_depth = np.tile(np.geomspace(0.005, 0.4, 48)[:, None], 64)
-    return (inverse_depth * np.exp(-sigma)).astype(np.float32), (inverse_depth * np.exp(sigma)).astype(np.float32)
+    return (inverse_depth * np.exp(-sigma)).astype(np.float32), (
+        inverse_depth * np.exp(sigma)
+    ).astype(np.float32)
 
 
 @pytest.mark.parametrize("sigma", [0.01, 0.037, 0.13, 0.5])

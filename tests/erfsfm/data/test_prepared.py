@@ -32,12 +32,21 @@ def roots(tmp_path: Path, write_root: Callable[..., Path]) -> list[Path]:
 
 
 @pytest.fixture
-def config(small: Small, roots: list[Path], measure: Callable[..., None], tmp_path: Path) -> ExperimentConfig:
+def config(
+    small: Small, roots: list[Path], measure: Callable[..., None], tmp_path: Path
+) -> ExperimentConfig:
     """Of a training by many views, measured already."""
     data = {"roots": roots, "validation": ["simulated/500"], "exclude": []}
-    teacher = {"views": "many", "stride": STRIDE, "structure_weight": 1.0, "translation_weight": 1.0}
+    teacher = {
+        "views": "many",
+        "stride": STRIDE,
+        "structure_weight": 1.0,
+        "translation_weight": 1.0,
+    }
     tree = small | {
-        "data": small["data"] | data | {"ranges": {"kitti_odometry/00": "2:11"}, "flip": 0.0, "zoom": 1.0},
+        "data": small["data"]
+        | data
+        | {"ranges": {"kitti_odometry/00": "2:11"}, "flip": 0.0, "zoom": 1.0},
         "teacher": teacher | {"cache": tmp_path / "measured"},
         "loss": {"photometric_weight": 0.0},
     }
@@ -51,7 +60,12 @@ def changed(config: ExperimentConfig, **data: Any) -> ExperimentConfig:
 
 
 def draws(config: ExperimentConfig, folder: Path) -> SnippetDraws:
-    return SnippetDraws(split_recordings(config.data)[0], config, 40, many_views=ManyViewTeacher(folder, SIZE, STRIDE))
+    return SnippetDraws(
+        split_recordings(config.data)[0],
+        config,
+        40,
+        many_views=ManyViewTeacher(folder, SIZE, STRIDE),
+    )
 
 
 def test_it_has_the_same_samples(config: ExperimentConfig, tmp_path: Path) -> None:
@@ -60,7 +74,9 @@ def test_it_has_the_same_samples(config: ExperimentConfig, tmp_path: Path) -> No
     original, again = draws(config, tmp_path / "measured"), draws(elsewhere, tmp_path / "nowhere")
     for number in range(6):
         one, other = original.draw(number), again.draw(number)
-        assert (one["sources"].float() - other["sources"].float()).abs().mean() < 6, "levels of 255, by JPEG"
+        assert (one["sources"].float() - other["sources"].float()).abs().mean() < 6, (
+            "levels of 255, by JPEG"
+        )
         torch.testing.assert_close(other["least"], one["least"], rtol=0.03, atol=0)
         torch.testing.assert_close(other["T_source_target"], one["T_source_target"])
         torch.testing.assert_close(other["K"], one["K"])
@@ -80,7 +96,9 @@ def test_a_part_of_it_has_its_own_labels(config: ExperimentConfig, tmp_path: Pat
     assert {recording.start + t for t in teacher.drive(recording).targets(sources=2)} == {5, 8}
 
 
-def test_validation_is_on_the_same_snippets_with_their_truth(config: ExperimentConfig, tmp_path: Path) -> None:
+def test_validation_is_on_the_same_snippets_with_their_truth(
+    config: ExperimentConfig, tmp_path: Path
+) -> None:
     prepare(config, tmp_path / "prepared")
     _, held_out = split_recordings(config.data)
     _, copied = split_recordings(changed(config, roots=[tmp_path / "prepared"]).data)
@@ -93,7 +111,11 @@ def test_validation_is_on_the_same_snippets_with_their_truth(config: ExperimentC
 
 
 def test_images_that_cannot_be_read_are_left_out(
-    config: ExperimentConfig, roots: list[Path], small: Small, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    config: ExperimentConfig,
+    roots: list[Path],
+    small: Small,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     (roots[0] / "sequences/00/image_2/000005.png").write_bytes(b"no image")
     tree = small | {"data": small["data"] | {"roots": roots[:1], "exclude": []}}
@@ -111,7 +133,9 @@ def test_what_is_there_is_never_overwritten(config: ExperimentConfig, tmp_path: 
     assert [path.name for path in (tmp_path / "prepared").iterdir()] == ["thesis.txt"]
 
 
-def test_one_that_fails_leaves_nothing(config: ExperimentConfig, roots: list[Path], tmp_path: Path) -> None:
+def test_one_that_fails_leaves_nothing(
+    config: ExperimentConfig, roots: list[Path], tmp_path: Path
+) -> None:
     before = sorted(tmp_path.iterdir())
     for image in sorted(roots[1].rglob("depth_2/*.png")):
         image.write_bytes(b"no depth")
@@ -128,12 +152,16 @@ def test_labels_of_another_teacher_are_asked_for(config: ExperimentConfig, tmp_p
 
 
 def test_stops_stay_out(small: Small, write_raw: Callable[..., Path], tmp_path: Path) -> None:
-    drive = write_raw(tmp_path / "raw", drive="2011_10_03_drive_0099", speeds=[5] * 6 + [0] * 3 + [5] * 6)
+    drive = write_raw(
+        tmp_path / "raw", drive="2011_10_03_drive_0099", speeds=[5] * 6 + [0] * 3 + [5] * 6
+    )
     tree = small | {"data": small["data"] | {"roots": [drive], "exclude": []}}
     config = ExperimentConfig.model_validate(tree)
     prepare(config, tmp_path / "prepared")
     names = [recording.frames_name for recording in discover(tmp_path / "prepared")]
-    assert names == [f"kitti_raw/2011_10_03_drive_0099{frames}" for frames in ("[0:6]", "[9:15]") * 2]
+    assert names == [
+        f"kitti_raw/2011_10_03_drive_0099{frames}" for frames in ("[0:6]", "[9:15]") * 2
+    ]
     assert trained_on(split_recordings(changed(config, roots=[tmp_path / "prepared"]).data)[0]) == [
         "kitti_raw/2011_10_03_drive_0099[0:6]",
         "kitti_raw/2011_10_03_drive_0099[9:15]",
@@ -143,10 +171,20 @@ def test_stops_stay_out(small: Small, write_raw: Callable[..., Path], tmp_path: 
 def test_the_command_says_how_to_go_on(write_root: Callable[..., Path], tmp_path: Path) -> None:
     world = write_root(tmp_path / "world", frames=8, seed=3)
     size = ["--set", "network.height=32", "--set", "network.width=64", "--set", "training.steps=2"]
-    command = ["train", "--config", "tiny", "--dataset", str(world), "--prepare", str(tmp_path / "prepared")]
+    command = [
+        "train",
+        "--config",
+        "tiny",
+        "--dataset",
+        str(world),
+        "--prepare",
+        str(tmp_path / "prepared"),
+    ]
     result = CliRunner().invoke(app, [*command, *size], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     told = " ".join(result.output.split()).partition("train with: erfsfm ")[2].split()
-    result = CliRunner().invoke(app, [*told, *size, "--output", str(tmp_path / "run")], catch_exceptions=False)
+    result = CliRunner().invoke(
+        app, [*told, *size, "--output", str(tmp_path / "run")], catch_exceptions=False
+    )
     assert result.exit_code == 0, result.output
     assert load_model(tmp_path / "run").record.trained_on == ["simulated/3"]

@@ -30,7 +30,9 @@ def spans(recording: Recording) -> list[tuple[int, int]]:
         ([0, 0.6, 0, 0, 0, 5], [(1, 2), (5, 6)]),
     ],
 )
-def test_by_speed(tmp_path: Path, write_raw: WriteDrive, speeds: list[float], expected: list[tuple[int, int]]) -> None:
+def test_by_speed(
+    tmp_path: Path, write_raw: WriteDrive, speeds: list[float], expected: list[tuple[int, int]]
+) -> None:
     for recording in open_drive(write_raw(tmp_path, speeds=speeds)):
         assert spans(recording) == expected
 
@@ -52,7 +54,12 @@ def street(shift: int, traffic: int, gain: float, rng: np.random.Generator) -> n
 
 @pytest.mark.parametrize(
     ("broken", "kept"),
-    [(None, [(0, 4), (7, 10)]), (0, [(0, 4), (7, 10)]), (4, [(0, 5), (7, 10)]), (5, [(0, 4), (5, 6), (7, 10)])],
+    [
+        (None, [(0, 4), (7, 10)]),
+        (0, [(0, 4), (7, 10)]),
+        (4, [(0, 5), (7, 10)]),
+        (5, [(0, 4), (5, 6), (7, 10)]),
+    ],
 )
 def test_by_images_where_there_is_no_speed(
     tmp_path: Path, write_raw: WriteDrive, broken: int | None, kept: list[tuple[int, int]]
@@ -93,6 +100,8 @@ def test_a_doubled_frame_of_an_own_recording_is_no_stop(
     for index in range(60):
         shift = 4 * (index if index < 20 else max(19, index - standing))
         cv2.imwrite(str(folder / "images" / f"{index:06d}.png"), street(shift, 0, 0, rng))
-    (folder / "camera.yaml").write_text("width: 208\nheight: 64\nfx: 150\nfy: 150\ncx: 104\ncy: 32\nfps: 10\n")
+    (folder / "camera.yaml").write_text(
+        "width: 208\nheight: 64\nfx: 150\nfy: 150\ncx: 104\ncy: 32\nfps: 10\n"
+    )
     training, _ = split_recordings(DataConfig(roots=[folder], validation=[]))
     assert [(part.start, part.start + len(part)) for part in training] == expected

@@ -37,7 +37,9 @@ def number(image: np.ndarray) -> int:
     return round((float(np.median(image)) + 2) / 5)  # codecs darken by up to 3 levels
 
 
-@pytest.mark.parametrize(("suffix", "codec"), [(".mp4", "mp4v"), (".avi", "MJPG"), (".mkv", "mp4v")])
+@pytest.mark.parametrize(
+    ("suffix", "codec"), [(".mp4", "mp4v"), (".avi", "MJPG"), (".mkv", "mp4v")]
+)
 def test_frames_in_any_order(tmp_path: Path, suffix: str, codec: str) -> None:
     video = Video(write(tmp_path / f"a{suffix}", codec=codec))
     assert (len(video), video.width, video.height) == (FRAMES, *SIZE)
@@ -65,16 +67,25 @@ def test_the_file_is_decoded_once_a_size(tmp_path: Path, monkeypatch: pytest.Mon
     assert len(opened) == 2
 
 
-def test_the_teacher_gets_the_frames_of_a_part_as_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_teacher_gets_the_frames_of_a_part_as_images(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     video = Video(write(tmp_path / "a.mp4"))
-    whole = Recording("folder/a", (video.path,) * len(video), Camera(48, 32, 40.0, 40.0, 23.5, 15.5), video)
+    whole = Recording(
+        "folder/a", (video.path,) * len(video), Camera(48, 32, 40.0, 40.0, 23.5, 15.5), video
+    )
     numbers: list[int] = []
 
     def slam(words: list[str]) -> str:
-        images, output = (Path(words[words.index(option) + 1]) for option in ("--dataset", "--output"))
+        images, output = (
+            Path(words[words.index(option) + 1]) for option in ("--dataset", "--output")
+        )
         numbers.extend(number(read_image(path)) for path in sorted(images.glob("*.png")))
         output.mkdir()
-        np.savetxt(output / "trajectory_optimised.kitti.txt", np.tile(np.eye(4)[:3].ravel(), (len(numbers), 1)))
+        np.savetxt(
+            output / "trajectory_optimised.kitti.txt",
+            np.tile(np.eye(4)[:3].ravel(), (len(numbers), 1)),
+        )
         (output / "metrics.json").write_text(json.dumps({"scale": {"mode": "camera-height"}}))
         return ""
 

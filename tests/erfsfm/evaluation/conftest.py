@@ -17,7 +17,9 @@ FOCAL, CX, CY = 60.0, 48.0, 32.0
 def _points_at(places: NDArray[np.float64], z: NDArray[np.float64]) -> NDArray[np.float32]:
     """Scans ``(N, 4)`` of points that fall on pixels ``(N, 2)`` (u, v), counted from one, at depth z."""
     x, y = (places[:, 0] - CX) / FOCAL * z, (places[:, 1] - CY) / FOCAL * z
-    return np.stack([z, -x, -y, np.full_like(z, 0.5)], axis=1).astype(np.float32)  # forward, left, up, reflectance
+    return np.stack([z, -x, -y, np.full_like(z, 0.5)], axis=1).astype(
+        np.float32
+    )  # forward, left, up, reflectance
 
 
 @pytest.fixture
@@ -37,10 +39,14 @@ def write_drive() -> Callable[..., Path]:
         (date / "calib_cam_to_cam.txt").write_text(
             f"calib_time: 09-Jan-2012 13:57:47\nR_rect_00: {identity}\nS_rect_02: {width} {height}\nP_rect_02: {row}\n"
         )
-        (date / "calib_velo_to_cam.txt").write_text("calib_time: x\nR: 0 -1 0 0 0 -1 1 0 0\nT: 0 0 0\n")
+        (date / "calib_velo_to_cam.txt").write_text(
+            "calib_time: x\nR: 0 -1 0 0 0 -1 1 0 0\nT: 0 0 0\n"
+        )
         if points is None:
             v, u = np.mgrid[1 : height + 1, 1 : width + 1]
-            points = _points_at(np.stack([u.ravel(), v.ravel()], axis=1).astype(float), np.full(u.size, 20.0))
+            points = _points_at(
+                np.stack([u.ravel(), v.ravel()], axis=1).astype(float), np.full(u.size, 20.0)
+            )
         stamps = [f"2011-09-26 13:10:51.{100_000_000 * k:09d}" for k in range(frames)]
         (drive / "oxts" / "timestamps.txt").write_text("\n".join(stamps) + "\n")
         for k in range(frames):

@@ -37,7 +37,9 @@ class Oracle:
         return np.full(image.shape[:2], self.depth_m / self.unit, np.float32)
 
     def poses(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64]:
-        assert [int(image[0, 0, 0]) for image in images] == sorted(int(image[0, 0, 0]) for image in images)
+        assert [int(image[0, 0, 0]) for image in images] == sorted(
+            int(image[0, 0, 0]) for image in images
+        )
         assert len(images) == 5
         T_source_target = np.tile(np.eye(4), (4, 1, 1))
         T_source_target[:, 2, 3] = np.array([2, 1, -1, -2]) / self.unit
@@ -50,7 +52,9 @@ class Oracle:
 @pytest.fixture
 def split(tmp_path: Path) -> str:
     path = tmp_path / "split.txt"
-    path.write_text(f"{DRIVE} 0\n2011_09_26/{DRIVE}_sync/image_02/data/0000000004.png\n\n{DRIVE}_sync 8 l\n")
+    path.write_text(
+        f"{DRIVE} 0\n2011_09_26/{DRIVE}_sync/image_02/data/0000000004.png\n\n{DRIVE}_sync 8 l\n"
+    )
     return str(path)
 
 
@@ -68,7 +72,9 @@ def test_both_scales(tmp_path: Path, write_drive: Write, split: str, fidelity: s
     assert set(oracle.asked) == {(32, 64, 3) if fidelity == "paper" else (64, 96, 3)}
 
 
-def test_a_wrong_unit_of_motion_affects_the_pose_row_alone(tmp_path: Path, write_drive: Write, split: str) -> None:
+def test_a_wrong_unit_of_motion_affects_the_pose_row_alone(
+    tmp_path: Path, write_drive: Write, split: str
+) -> None:
     root = write_drive(tmp_path / "raw", speed=12.0)
     median, pose, _ = eigen_protocol(Oracle(), root, split, "default", allow_leak=False)
     assert median["abs_rel"] == pytest.approx(0, abs=1e-5)
@@ -79,8 +85,12 @@ def test_clipping_is_what_fidelity_changes(tmp_path: Path, write_drive: Write, s
     """200 units are clipped to 80 before scaling (paper), or 20 m after it (default)."""
     root = write_drive(tmp_path / "raw")
     far = Oracle(unit=0.1)
-    assert eigen_protocol(far, root, split, "default", False)[1]["abs_rel"] == pytest.approx(0, abs=1e-5)
-    assert eigen_protocol(far, root, split, "paper", False)[1]["abs_rel"] == pytest.approx(1 - 80 * 0.1 / 20, abs=1e-5)
+    assert eigen_protocol(far, root, split, "default", False)[1]["abs_rel"] == pytest.approx(
+        0, abs=1e-5
+    )
+    assert eigen_protocol(far, root, split, "paper", False)[1]["abs_rel"] == pytest.approx(
+        1 - 80 * 0.1 / 20, abs=1e-5
+    )
 
 
 def test_a_car_that_stands_still(tmp_path: Path, write_drive: Write, split: str) -> None:
@@ -100,7 +110,9 @@ def test_leaks_are_refused_by_frame(tmp_path: Path, write_drive: Write, split: s
     with pytest.raises(DataError, match=rf"leak: .*{DRIVE}\[4:5\]"):
         eigen_protocol(seen, root, split, "default", allow_leak=False)
     assert eigen_protocol(seen, root, split, "default", allow_leak=True)[0]["leak"] is True
-    eigen_protocol(Oracle(seen=[f"kitti_raw/{DRIVE}[5:8]"]), root, split, "default", allow_leak=False)
+    eigen_protocol(
+        Oracle(seen=[f"kitti_raw/{DRIVE}[5:8]"]), root, split, "default", allow_leak=False
+    )
 
 
 def test_the_eigen_list(tmp_path: Path) -> None:
@@ -123,17 +135,23 @@ def test_a_given_scale_and_clipping_by_hand() -> None:
     after = depth_errors(guess, truth, scaling=2.0)
     assert before is not None
     assert after is not None
-    assert before.abs_rel == pytest.approx((0.4 + 100 / 60) / 2), "80 doubled, and not clipped again"
+    assert before.abs_rel == pytest.approx((0.4 + 100 / 60) / 2), (
+        "80 doubled, and not clipped again"
+    )
     assert after.abs_rel == pytest.approx((0.4 + 20 / 60) / 2)
 
 
 @pytest.mark.data
 def test_shipped_weights_on_a_real_drive(data_root: Path, tmp_path: Path) -> None:
     """Never seen in training: better than the baseline, and both fidelities agree where clipping does not matter."""
-    (tmp_path / "split.txt").write_text("".join(f"2011_09_26_drive_0013 {i}\n" for i in (5, 25, 45)))
+    (tmp_path / "split.txt").write_text(
+        "".join(f"2011_09_26_drive_0013 {i}\n" for i in (5, 25, 45))
+    )
     predictor = DepthPosePredictor.from_weights("default")
     root, split = data_root / "kitti_raw", str(tmp_path / "split.txt")
-    rows = {f: eigen_protocol(predictor, root, split, f, allow_leak=False) for f in ("default", "paper")}
+    rows = {
+        f: eigen_protocol(predictor, root, split, f, allow_leak=False) for f in ("default", "paper")
+    }
     assert rows["default"][0]["abs_rel"] < 0.4
     assert rows["paper"][0]["abs_rel"] == pytest.approx(rows["default"][0]["abs_rel"], rel=0.02)
     assert 5 < rows["default"][1]["scale"] < 200
@@ -174,7 +192,9 @@ def test_displacements_are_trapezoids(tmp_path: Path, write_drive: Write) -> Non
     values = np.zeros(30)
     values[6] = 20.0  # northwards, in frame 5 alone: 0.1 s of mean 10 m/s on each side
     (oxts / "0000000005.txt").write_text(" ".join(map(str, values)))
-    np.testing.assert_allclose(displacements(RawFrame(root, DRIVE, 4), [2, 3, 4, 5, 6]), [0, 0, 1, 2], atol=1e-5)
+    np.testing.assert_allclose(
+        displacements(RawFrame(root, DRIVE, 4), [2, 3, 4, 5, 6]), [0, 0, 1, 2], atol=1e-5
+    )
 
 
 @pytest.mark.data
@@ -196,7 +216,9 @@ def test_a_real_drive_moves_as_its_gps_does(data_root: Path) -> None:
     frame = RawFrame(data_root / "kitti_raw", "2011_09_26_drive_0013", 60)
     places = []
     for index in (58, 60):
-        north, east = np.radians(np.loadtxt(frame.folder / "oxts/data" / f"{index:010d}.txt")[:2]) * 6378137.0
+        north, east = (
+            np.radians(np.loadtxt(frame.folder / "oxts/data" / f"{index:010d}.txt")[:2]) * 6378137.0
+        )
         places.append([north, east * np.cos(np.radians(49.0131))])
     gps = np.linalg.norm(np.subtract(*places))
     assert displacements(frame, frame.window(4))[0] == pytest.approx(gps, rel=0.05)

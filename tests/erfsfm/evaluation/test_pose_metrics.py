@@ -61,8 +61,14 @@ def test_hand_value_of_re_counts_the_first_frame() -> None:
 
 def test_paper_fidelity_averages_over_four_zero_rows() -> None:
     rng = np.random.default_rng(2)
-    true, predicted = snippets_from_trajectory(random_poses(rng, 30)), snippets_from_trajectory(random_poses(rng, 30))
-    plain, paper = snippet_errors(predicted, true), snippet_errors(predicted, true, fidelity="paper")
+    true, predicted = (
+        snippets_from_trajectory(random_poses(rng, 30)),
+        snippets_from_trajectory(random_poses(rng, 30)),
+    )
+    plain, paper = (
+        snippet_errors(predicted, true),
+        snippet_errors(predicted, true, fidelity="paper"),
+    )
     assert paper.ate_mean == pytest.approx(plain.ate_mean * 26 / 30, rel=1e-12)
     assert paper.re_mean == pytest.approx(plain.re_mean * 26 / 30, rel=1e-12)
     square = (plain.ate_std**2 + plain.ate_mean**2) * 26 / 30
@@ -73,7 +79,9 @@ def test_paper_fidelity_averages_over_four_zero_rows() -> None:
 def test_no_predicted_motion_is_scored_as_standing_still() -> None:
     errors = snippet_errors(straight([0] * 5)[None], straight([0, 3, 0, 4, 0])[None])
     assert errors == SnippetErrors(1.0, 0.0, 0.0, 0.0, 1)
-    rounding = snippet_errors(straight([0, 3e-16, 0, 4e-16, 0])[None], straight([0, 3, 0, 4, 0])[None])
+    rounding = snippet_errors(
+        straight([0, 3e-16, 0, 4e-16, 0])[None], straight([0, 3, 0, 4, 0])[None]
+    )
     assert rounding == errors
 
 
@@ -82,7 +90,9 @@ def test_snippets_start_at_the_identity_and_hold_relative_poses() -> None:
     snippets = snippets_from_trajectory(T_world_camera)
     assert snippets.shape == (5, 5, 4, 4)
     np.testing.assert_allclose(snippets[:, 0], np.tile(np.eye(4), (5, 1, 1)), atol=1e-14)
-    np.testing.assert_allclose(snippets[2, 3], np.linalg.inv(T_world_camera[2]) @ T_world_camera[5], atol=1e-14)
+    np.testing.assert_allclose(
+        snippets[2, 3], np.linalg.inv(T_world_camera[2]) @ T_world_camera[5], atol=1e-14
+    )
     assert snippets_from_trajectory(T_world_camera[:4]).shape == (0, 5, 4, 4)
 
 
@@ -115,14 +125,23 @@ def printed(errors: SnippetErrors) -> tuple[float, float, float]:
     ],
 )
 def test_scores_of_public_trajectories(
-    data_root: Path, sequence: str, stereo: tuple[float, ...], ahead: tuple[float, ...], mean_motion: tuple[float, ...]
+    data_root: Path,
+    sequence: str,
+    stereo: tuple[float, ...],
+    ahead: tuple[float, ...],
+    mean_motion: tuple[float, ...],
 ) -> None:
     """DF-VO's stereo-trained trajectories, and the two constant motions that every network must beat."""
     T_world_camera = read_kitti(data_root / "golden" / f"reference_{sequence}.txt")
     true = snippets_from_trajectory(T_world_camera)
-    dfvo = snippets_from_trajectory(read_kitti(data_root / "golden" / f"dfvo_stereo_{sequence}.txt"))
+    dfvo = snippets_from_trajectory(
+        read_kitti(data_root / "golden" / f"dfvo_stereo_{sequence}.txt")
+    )
     assert printed(snippet_errors(dfvo, true)) == stereo
-    assert printed(snippet_errors(np.tile(straight([0, 1, 2, 3, 4]), (len(true), 1, 1, 1)), true)) == ahead
+    assert (
+        printed(snippet_errors(np.tile(straight([0, 1, 2, 3, 4]), (len(true), 1, 1, 1)), true))
+        == ahead
+    )
     steps = np.linalg.inv(T_world_camera[:-1]) @ T_world_camera[1:]
     step = np.eye(4)
     step[:3, :3] = Rotation.from_matrix(steps[:, :3, :3]).mean().as_matrix()

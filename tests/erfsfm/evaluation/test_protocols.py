@@ -36,7 +36,9 @@ class Oracle:
 
     measures = False
 
-    def __init__(self, step: tuple[float, float, float], sources: int = 4, seen: Sequence[str] = ()) -> None:
+    def __init__(
+        self, step: tuple[float, float, float], sources: int = 4, seen: Sequence[str] = ()
+    ) -> None:
         self.step = np.array(step)
         self.sources = sources
         self.seen = seen
@@ -48,7 +50,9 @@ class Oracle:
     def depth(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         return np.full(image.shape[:2], 3.0, np.float32)
 
-    def measured_poses(self, guess: NDArray[np.float64], images: Sequence[NDArray[np.uint8]], camera: Pinhole):
+    def measured_poses(
+        self, guess: NDArray[np.float64], images: Sequence[NDArray[np.uint8]], camera: Pinhole
+    ):
         assert (camera.height, camera.width) == images[0].shape[:2]
         return guess
 
@@ -76,13 +80,17 @@ def test_depth(tmp_path: Path, write_root: Callable[..., Path]) -> None:
     assert median["method"] == "median depth map"
 
 
-def test_depth_of_a_pack(tmp_path: Path, write_root: Callable[..., Path], small: dict[str, dict[str, object]]) -> None:
+def test_depth_of_a_pack(
+    tmp_path: Path, write_root: Callable[..., Path], small: dict[str, dict[str, object]]
+) -> None:
     """It holds smaller images than depth maps, and depth of the middle of each snippet alone."""
     roots = [write_root(tmp_path / "seen", frames=3, seed=1)]
     roots += [write_root(tmp_path / "held_out", frames=11, depth=True, seed=500, step=STEP)]
     data = {"roots": roots, "validation": ["simulated/500"]}
     prepare(ExperimentConfig.model_validate(small | {"data": data}), tmp_path / "prepared")
-    networks, _ = depth_protocol({"networks": Oracle(STEP)}, [tmp_path / "prepared"], allow_leak=False)
+    networks, _ = depth_protocol(
+        {"networks": Oracle(STEP)}, [tmp_path / "prepared"], allow_leak=False
+    )
     assert networks["images"] == 9
     assert networks["abs_rel"] == pytest.approx(0, abs=1e-3)
 
@@ -97,7 +105,9 @@ def test_pose(tmp_path: Path, write_root: Callable[..., Path], name: str) -> Non
     assert networks["leak"] is False
 
 
-def test_the_pose_network_alone_stands_beside_what_is_measured(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+def test_the_pose_network_alone_stands_beside_what_is_measured(
+    tmp_path: Path, write_root: Callable[..., Path]
+) -> None:
     write_root(tmp_path, frames=9, step=STEP)
 
     class Measuring(Oracle):
@@ -108,11 +118,17 @@ def test_the_pose_network_alone_stands_beside_what_is_measured(tmp_path: Path, w
             return Oracle.guessed_poses(self, images)
 
     rows = pose_protocol(Measuring(STEP), tmp_path, ["00"], "default", allow_leak=False)
-    assert [row["method"] for row in rows] == ["networks", "pose network alone", "straight constant motion"]
+    assert [row["method"] for row in rows] == [
+        "networks",
+        "pose network alone",
+        "straight constant motion",
+    ]
     assert rows[0]["ate_mean"] == pytest.approx(0, abs=1e-9) and rows[1]["ate_mean"] > 0.01
 
 
-def test_frames_of_a_sequence_are_checked_for_leaks(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+def test_frames_of_a_sequence_are_checked_for_leaks(
+    tmp_path: Path, write_root: Callable[..., Path]
+) -> None:
     write_root(tmp_path, frames=20, step=STEP)
     seen = Oracle(STEP, seen=["kitti_odometry/00[0:12]"])
     networks, _ = pose_protocol(seen, tmp_path, ["00[12:]"], "default", allow_leak=False)
@@ -122,7 +138,9 @@ def test_frames_of_a_sequence_are_checked_for_leaks(tmp_path: Path, write_root: 
         pose_protocol(seen, tmp_path, ["00[11:]"], "default", allow_leak=False)
 
 
-def test_paper_fidelity_counts_four_empty_snippets(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+def test_paper_fidelity_counts_four_empty_snippets(
+    tmp_path: Path, write_root: Callable[..., Path]
+) -> None:
     write_root(tmp_path, frames=9, step=STEP)
     default = pose_protocol(Oracle(STEP), tmp_path, ["00"], "default", allow_leak=False)[1]
     paper = pose_protocol(Oracle(STEP), tmp_path, ["00"], "paper", allow_leak=False)[1]
@@ -153,7 +171,9 @@ def write_pairs(root: Path, street: str, farther: list[bool]) -> None:
     for folder in ("images", "truth"):
         (root / folder).mkdir(parents=True, exist_ok=True)
     for index, with_far in enumerate(farther):
-        cv2.imwrite(str(root / "images" / f"{street}_{index:06d}.jpg"), np.zeros((64, 96, 3), np.uint8))
+        cv2.imwrite(
+            str(root / "images" / f"{street}_{index:06d}.jpg"), np.zeros((64, 96, 3), np.uint8)
+        )
         truth = np.zeros((64, 96), np.uint16)
         truth[[40, 40, 50, 50], [40, 50, 40, 50]] = 2560
         truth[50, 50] *= 1 + with_far
@@ -162,7 +182,9 @@ def write_pairs(root: Path, street: str, farther: list[bool]) -> None:
 
 
 def test_standard_error_and_ratio_are_those_over_streets() -> None:
-    assert standard_error([1.0, 3.0]) == pytest.approx(1.0), "a standard deviation of sqrt(2) of two streets"
+    assert standard_error([1.0, 3.0]) == pytest.approx(1.0), (
+        "a standard deviation of sqrt(2) of two streets"
+    )
     assert standard_error([1.0]) is None
     ratio, error = mean_ratio([0.1, 0.4], to=[0.2, 0.2])
     assert ratio == pytest.approx(1.0) and error == pytest.approx(np.log(2))
@@ -198,7 +220,9 @@ def test_a_picture_of_each_street_shows_image_depths_and_truth(tmp_path: Path) -
 def test_networks_are_compared_street_by_street(tmp_path: Path) -> None:
     write_pairs(tmp_path / "pairs", "06", [True] * 4)
     write_pairs(tmp_path / "pairs", "08", [True, False])
-    mean, other, *single = depth_protocol({"a": Flat(), "b": Slanted()}, [tmp_path / "pairs"], allow_leak=False)
+    mean, other, *single = depth_protocol(
+        {"a": Flat(), "b": Slanted()}, [tmp_path / "pairs"], allow_leak=False
+    )
     assert "ratio" not in mean
     assert [(row["method"], row["street"][-2:]) for row in single] == [
         ("a", "06"),
@@ -209,15 +233,24 @@ def test_networks_are_compared_street_by_street(tmp_path: Path) -> None:
     ratios = [single[1]["ratio"], single[3]["ratio"]]
     assert ratios[0] == pytest.approx(single[1]["abs_rel"] / single[0]["abs_rel"])
     assert other["ratio"] == pytest.approx(np.sqrt(np.prod(ratios)))
-    assert other["ratio_se"] == pytest.approx(other["ratio"] * abs(np.log(ratios[0] / ratios[1])) / 2)
+    assert other["ratio_se"] == pytest.approx(
+        other["ratio"] * abs(np.log(ratios[0] / ratios[1])) / 2
+    )
 
 
 def test_drives_with_lidar_and_worlds_are_streets(
     tmp_path: Path, write_drive: Callable[..., Path], write_root: Callable[..., Path]
 ) -> None:
-    roots = [write_drive(tmp_path / "raw"), write_root(tmp_path / "world", frames=11, depth=True, seed=600)]
+    roots = [
+        write_drive(tmp_path / "raw"),
+        write_root(tmp_path / "world", frames=11, depth=True, seed=600),
+    ]
     rows = depth_protocol({"networks": Flat()}, roots, allow_leak=False)  # type: ignore[arg-type]
-    assert [row.get("street") for row in rows] == [None, "kitti_raw/2011_09_26_drive_0099", "simulated/600"]
+    assert [row.get("street") for row in rows] == [
+        None,
+        "kitti_raw/2011_09_26_drive_0099",
+        "simulated/600",
+    ]
     assert [row["images"] for row in rows] == [5, 2, 3], "every fifth frame"
     assert rows[0]["abs_rel"] == pytest.approx(0, abs=1e-3)
     assert rows[0]["abs_rel_se"] == pytest.approx(0, abs=1e-3)
@@ -261,7 +294,9 @@ class Networks:
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
     root = tmp_path_factory.mktemp("world") / "world"
-    street = SimulatedStreet(SimulationOptions(frames=13, seed=707, route="straight", width=416, height=128))
+    street = SimulatedStreet(
+        SimulationOptions(frames=13, seed=707, route="straight", width=416, height=128)
+    )
     write_kitti_root(street, root, depth=True)
     return root
 
@@ -272,7 +307,9 @@ def cache(world, tmp_path_factory):
     folder, recording = tmp_path_factory.mktemp("cache"), discover(world)[0]
     T_world_camera = recording.true_poses().copy()
     T_world_camera[:, :3, 3] /= HEIGHT_M
-    ManyViewTeacher(folder / TRUTH_FOLDER, (128, 416), EVERY).drive(recording).keep_poses(T_world_camera)
+    ManyViewTeacher(folder / TRUTH_FOLDER, (128, 416), EVERY).drive(recording).keep_poses(
+        T_world_camera
+    )
     return folder
 
 
@@ -285,7 +322,9 @@ def test_true_depth_is_right_and_constant_depth_is_wrong(world, cache):
     recording = discover(world)[0]
     (right,) = rows_of(Networks(recording, right=True), world, cache)
     (wrong,) = rows_of(Networks(recording, right=False), world, cache)
-    assert right["images"] == wrong["images"] == 2, "every fifth frame that has two neighbours on either side"
+    assert right["images"] == wrong["images"] == 2, (
+        "every fifth frame that has two neighbours on either side"
+    )
     assert right["abs_rel"] < 0.08 < 0.2 < wrong["abs_rel"]
     assert 0.3 < right["known"] == wrong["known"] < 1
     assert right["recording"] == "simulated/707[0:13]" and right["leak"] is False

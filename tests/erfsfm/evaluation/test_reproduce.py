@@ -14,8 +14,18 @@ import pytest
 from erfsfm.common.errors import ConfigError
 
 TOOLS = Path(__file__).parents[3] / "tools"
-SMALL = ["network.depth_width=0.0625", "network.pose_width=0.125", "network.height=32", "network.width=64"]
-SHORT = ["training.steps=2", "training.checkpoint_every=2", "training.validate_every=2", "data.workers=0"]
+SMALL = [
+    "network.depth_width=0.0625",
+    "network.pose_width=0.125",
+    "network.height=32",
+    "network.width=64",
+]
+SHORT = [
+    "training.steps=2",
+    "training.checkpoint_every=2",
+    "training.validate_every=2",
+    "data.workers=0",
+]
 
 
 @pytest.fixture
@@ -29,7 +39,12 @@ def test_rows_are_those_of_the_paper(tool: dict[str, Any]) -> None:
     assert len(rows) == 36 and len({row.training for row in rows}) == 15
     first = tool["paper_rows"](["table1-posenet-416x128"])
     assert [row.scale for row in first] == ["", "GT", "PoseNet"]
-    assert first[0].figures == ("0.021 ± 0.0157", "0.0048 ± 0.0029", "0.0145 ± 0.009", "0.0047 ± 0.0034")
+    assert first[0].figures == (
+        "0.021 ± 0.0157",
+        "0.0048 ± 0.0029",
+        "0.0145 ± 0.009",
+        "0.0047 ± 0.0034",
+    )
     with pytest.raises(ConfigError, match="table9"):
         tool["paper_rows"](["table9-*"])
 
@@ -47,7 +62,19 @@ def test_tables_of_a_small_fake(
     raw, split = write_drive(tmp_path / "raw"), tmp_path / "frames.txt"
     split.write_text("2011_09_26_drive_0099 4\n")
     row, output = "table1-erf-posenet-dfc-416x128", tmp_path / "paper"
-    words = ["--kitti", str(kitti), "--rows", row, "--output", str(output), "--device", "cpu", "--set", *SMALL, *SHORT]
+    words = [
+        "--kitti",
+        str(kitti),
+        "--rows",
+        row,
+        "--output",
+        str(output),
+        "--device",
+        "cpu",
+        "--set",
+        *SMALL,
+        *SHORT,
+    ]
     tool["main"](words)
     said = capsys.readouterr()
     assert "2 steps of" in said.err and "all trainings: " in said.err
@@ -58,14 +85,19 @@ def test_tables_of_a_small_fake(
     table = (output / "tables.md").read_text().splitlines()
     lines = [line.split(" | ") for line in table if f"`{row}`" in line]
     assert [line[2] for line in lines[:2]] == ["paper", "ours"]
-    assert [line[1:3] for line in lines[2:]] == [[s, b] for s in ("GT", "PoseNet") for b in ("paper", "ours")]
+    assert [line[1:3] for line in lines[2:]] == [
+        [s, b] for s in ("GT", "PoseNet") for b in ("paper", "ours")
+    ]
     assert "-" not in lines[3], "depth was evaluated later"
     kept = json.loads((output / row / "paper.json").read_text())
     assert kept["depth"][0]["images"] == 1
 
 
 def test_what_is_tested_is_required_first(
-    tool: dict[str, Any], tmp_path: Path, write_root: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+    tool: dict[str, Any],
+    tmp_path: Path,
+    write_root: Callable[..., Path],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     kitti = write_root(tmp_path / "kitti", frames=12, sequences=("00", "06", "09"))
     monkeypatch.setattr(sys, "argv", ["reproduce.py"])

@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 
 from erfsfm.mvs.fusion import DepthFusion
-from erfsfm.mvs.refine import EDGE_GREY_LEVELS, LARGE_STEP, SMALL_STEP, UNIT, RefinedDepth, measure, smoothed
+from erfsfm.mvs.refine import (
+    EDGE_GREY_LEVELS,
+    LARGE_STEP,
+    SMALL_STEP,
+    UNIT,
+    RefinedDepth,
+    measure,
+    smoothed,
+)
 from erfsfm.mvs.views import Appearance
 
 H, W = 96, 240
@@ -33,7 +41,9 @@ def painted(which: int, a: np.ndarray, b: np.ndarray, scale: float) -> np.ndarra
     return cv2.remap(TEXTURES[which], *wrapped, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
 
 
-def wall_and_step(position: tuple[float, float, float], far: float = 12.0) -> tuple[np.ndarray, np.ndarray]:
+def wall_and_step(
+    position: tuple[float, float, float], far: float = 12.0
+) -> tuple[np.ndarray, np.ndarray]:
     """A wall, and 6 m away a board in front of its left half: image and depth."""
     x, y, z = position
     near_x, near_y = X * (6 - z) + x, Y * (6 - z) + y
@@ -43,7 +53,9 @@ def wall_and_step(position: tuple[float, float, float], far: float = 12.0) -> tu
     return image.astype(np.uint8), np.where(board, 6 - z, far - z).astype(np.float32)
 
 
-def road_and_car(position: tuple[float, float, float], frame: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def road_and_car(
+    position: tuple[float, float, float], frame: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A road under a sky at infinity, and a car that keeps 8 m ahead: image, depth, mask of the car."""
     x, _, z = position
     car = (np.abs(X * 8) < 1.5) & (Y * 8 < HEIGHT) & (Y * 8 > -0.2)
@@ -76,7 +88,10 @@ def test_a_wall_and_a_step_are_found_from_a_wrong_guess() -> None:
 def test_sigma_is_honest() -> None:
     images = [wall_and_step(position)[0] for position in [(0.0, 0.0, 0.0), *POSITIONS]]
     noise = np.random.default_rng(0)
-    noisy = [np.clip(image + noise.normal(0, 4, image.shape), 0, 255).astype(np.uint8) for image in images]
+    noisy = [
+        np.clip(image + noise.normal(0, 4, image.shape), 0, 255).astype(np.uint8)
+        for image in images
+    ]
     truth = wall_and_step((0.0, 0.0, 0.0))[1]
     found = refined(noisy, truth * 1.2)
     z = np.abs(np.log(found.depth / truth)) / found.relative_sigma
@@ -156,4 +171,6 @@ def test_paths_equal_those_of_an_obvious_loop() -> None:
     costs = rng.random((5, 6, 7)).astype(np.float32)
     grey = rng.uniform(0, 40, (6, 7)).astype(np.float32)
     found, expected = smoothed(np.asarray(UNIT * costs, np.int16), grey) / UNIT, slowly(costs, grey)
-    np.testing.assert_allclose(found - found.min(axis=0), expected - expected.min(axis=0), atol=0.01)
+    np.testing.assert_allclose(
+        found - found.min(axis=0), expected - expected.min(axis=0), atol=0.01
+    )

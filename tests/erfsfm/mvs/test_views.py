@@ -35,4 +35,6 @@ def test_derivatives_are_those_of_small_differences() -> None:
 
 def test_halving_keeps_rays() -> None:
     # the centre of the first half-size pixel is between the first four pixels
-    np.testing.assert_allclose(np.linalg.inv(halved(K)) @ [0, 0, 1], np.linalg.inv(K) @ [0.5, 0.5, 1])
+    np.testing.assert_allclose(
+        np.linalg.inv(halved(K)) @ [0, 0, 1], np.linalg.inv(K) @ [0.5, 0.5, 1]
+    )

@@ -31,5 +31,7 @@ def test_batch_norm_sits_between_convolution_and_relu(deformable):
     block = ConvBlock(2, 4, Layer(3, 1, deformable=deformable), normalisation="batch")
     assert [type(module) for module in block][1:] == [nn.BatchNorm2d, nn.ReLU]
     plain = ConvBlock(2, 4, Layer(3, 1, deformable=deformable))
-    difference = sum(p.numel() for p in block.parameters()) - sum(p.numel() for p in plain.parameters())
+    difference = sum(p.numel() for p in block.parameters()) - sum(
+        p.numel() for p in plain.parameters()
+    )
     assert difference == 8

@@ -40,9 +40,17 @@ def reference(input, offset, weight, bias, stride, padding, dilation, mask):
                 y = i * stride[0] - padding[0] + tap // k_w * dilation[0] + dy
                 x = j * stride[1] - padding[1] + tap % k_w * dilation[1] + dx
                 columns.append(mask[b, group * taps + tap, i, j] * bilinear(image, y, x))
-        read = torch.stack(columns).view(offset_groups, taps, -1).permute(0, 2, 1).reshape(channels, taps)
+        read = (
+            torch.stack(columns)
+            .view(offset_groups, taps, -1)
+            .permute(0, 2, 1)
+            .reshape(channels, taps)
+        )
         groups = channels // inside
-        parts = [w.flatten(1) @ r.flatten() for w, r in zip(weight.chunk(groups), read.view(groups, inside, taps))]
+        parts = [
+            w.flatten(1) @ r.flatten()
+            for w, r in zip(weight.chunk(groups), read.view(groups, inside, taps))
+        ]
         results.append(torch.cat(parts) + bias)
     return torch.stack(results).view(batch, out_h, out_w, out_channels).permute(0, 3, 1, 2)
 
@@ -53,7 +61,10 @@ def make_case(size, kernel, stride, padding, dilation, offset_groups, weight_gro
     def draw(*shape):
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
-    out = [(n + 2 * p - d * (k - 1) - 1) // s + 1 for n, k, s, p, d in zip(size, kernel, stride, padding, dilation)]
+    out = [
+        (n + 2 * p - d * (k - 1) - 1) // s + 1
+        for n, k, s, p, d in zip(size, kernel, stride, padding, dilation)
+    ]
     taps = kernel[0] * kernel[1]
     tensors = {
         "input": draw(2, 4, *size),
@@ -98,7 +109,8 @@ def test_values_and_gradients_equal_the_definition(case, monkeypatch):
 def test_gradcheck():
     tensors = make_case((2, 3), (2, 2), (1, 1), (1, 1), (1, 1), 2, 1, 0.6, seed=1)
     assert torch.autograd.gradcheck(
-        lambda *arguments: deform_conv2d(*arguments[:4], padding=1, mask=arguments[4]), list(tensors.values())
+        lambda *arguments: deform_conv2d(*arguments[:4], padding=1, mask=arguments[4]),
+        list(tensors.values()),
     )
 
 
@@ -113,8 +125,12 @@ def test_float32_is_close_to_float64(case):
 
 
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float64, 1e-10), (torch.float32, 2e-3)])
-@pytest.mark.parametrize("stride, padding, dilation", [(1, 1, 1), (2, 1, 1), ((2, 1), (0, 3), (1, 2))])
-def test_zero_offsets_and_unit_mask_are_plain_convolution(stride, padding, dilation, dtype, tolerance):
+@pytest.mark.parametrize(
+    "stride, padding, dilation", [(1, 1, 1), (2, 1, 1), ((2, 1), (0, 3), (1, 2))]
+)
+def test_zero_offsets_and_unit_mask_are_plain_convolution(
+    stride, padding, dilation, dtype, tolerance
+):
     features, weight, bias = torch.randn(2, 4, 37, 101), torch.randn(6, 2, 3, 3), torch.randn(6)
     features, weight, bias = features.to(dtype), weight.to(dtype), bias.to(dtype)
     plain = F.conv2d(features, weight, bias, stride, padding, dilation, groups=2)

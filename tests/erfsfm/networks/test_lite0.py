@@ -73,4 +73,6 @@ def test_padding_is_tensorflows_same():
     image[0, 0, 0, 0] = 1
     with torch.no_grad():
         output = block.eval()(image)
-    assert output[0, 0, 0, 0] > 0 and output[0, 0].count_nonzero() == 1  # windows begin at even pixels
+    assert (
+        output[0, 0, 0, 0] > 0 and output[0, 0].count_nonzero() == 1
+    )  # windows begin at even pixels

@@ -51,7 +51,9 @@ SLOW = ("erf-depthnet-dilated", "erf-depthnet-dfcv2", "erf-posenet-dfc", "erf-po
     + [pytest.param(name, marks=pytest.mark.slow) for name in SLOW],
 )
 @torch.inference_mode()
-def test_a_graph_has_the_outputs_of_its_network_on_other_images_too(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_graph_has_the_outputs_of_its_network_on_other_images_too(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(deformable, "_LARGE", 2**40)  # all in plain PyTorch
     kind = "depth" if "depth" in name else "pose"
     network = with_moving_taps(build(name, width=0.125, sources=4))
@@ -66,7 +68,9 @@ def test_a_graph_has_the_outputs_of_its_network_on_other_images_too(name: str, m
 
 
 @torch.inference_mode()
-def test_networks_with_large_deformable_layers_are_not_exported(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_networks_with_large_deformable_layers_are_not_exported(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(deformable, "_LARGE", 1)
     network = with_moving_taps(build("erf-depthnet-dfc", width=0.25))
     graph, calls = OnnxGraph(lambda: network, 1, "a network"), calls_of(network)
@@ -110,7 +114,9 @@ def test_the_graph_of_a_network_is_read_again_and_no_other(tmp_path: Path) -> No
     assert folder() == tmp_path / "erfsfm" and len(list(folder().iterdir())) == 1
     assert output(3.0, "two") == 2.0, "the graph was made again"
     assert output(3.0, "three") == 3.0
-    assert output(3.0, "two", np.ones((1, 3, 8, 8), np.float32)) == 3.0, "the graph is of images of another size"
+    assert output(3.0, "two", np.ones((1, 3, 8, 8), np.float32)) == 3.0, (
+        "the graph is of images of another size"
+    )
 
 
 def test_a_damaged_graph_is_made_again() -> None:
@@ -123,8 +129,12 @@ def test_a_damaged_graph_is_made_again() -> None:
 
 
 @pytest.mark.parametrize("changed", ["networks/blocks.py", "geometry.py"])
-def test_a_graph_of_older_code_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changed: str) -> None:
-    package = shutil.copytree(Path(onnx_graph.__file__).parents[1], tmp_path / "code", ignore=NO_CODE)
+def test_a_graph_of_older_code_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changed: str
+) -> None:
+    package = shutil.copytree(
+        Path(onnx_graph.__file__).parents[1], tmp_path / "code", ignore=NO_CODE
+    )
     monkeypatch.setattr(onnx_graph, "__file__", str(package / "networks" / "onnx_graph.py"))
     assert kept_graph("one", b"old") == b"old" == kept_graph("one", b"new")
     (package / changed).write_text("# changed")

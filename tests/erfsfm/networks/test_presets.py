@@ -41,7 +41,11 @@ def test_pose_parameters(name, four, two):
 def test_fidelity_decides_where_offsets_start():
     for fidelity, neutral in [("default", True), ("paper", False)]:
         state = build("erf-posenet-dfc", fidelity=fidelity, width=0.25).state_dict()
-        weights = [value for name, value in state.items() if name.endswith(("offset.weight", "modulator.weight"))]
+        weights = [
+            value
+            for name, value in state.items()
+            if name.endswith(("offset.weight", "modulator.weight"))
+        ]
         assert len(weights) == 10
         assert all((not value.any()) == neutral for value in weights)
 

@@ -4,7 +4,13 @@ import pytest
 import torch
 
 from erfsfm.networks.presets import build
-from erfsfm.networks.receptive_field import field_of, measured, multiply_adds, theoretical, theoretical_corner
+from erfsfm.networks.receptive_field import (
+    field_of,
+    measured,
+    multiply_adds,
+    theoretical,
+    theoretical_corner,
+)
 
 
 def small(name, fidelity="default"):

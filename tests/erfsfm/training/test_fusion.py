@@ -23,7 +23,9 @@ def test_a_fresh_network_trusts_the_measurement_at_every_pixel() -> None:
     block[:] = torch.rand(block.shape)
     change, log_sigma = FusionNet(CHANNELS, 4 * CHANGE).eval()(evidence)
     measured = torch.nn.functional.pixel_shuffle(block, 2)[:, 0]
-    torch.testing.assert_close(change / measured, torch.full_like(measured, torch.sigmoid(torch.tensor(3.0)).item()))
+    torch.testing.assert_close(
+        change / measured, torch.full_like(measured, torch.sigmoid(torch.tensor(3.0)).item())
+    )
     assert log_sigma.shape == change.shape == (1, 32, 48)
 
 
@@ -33,11 +35,18 @@ def test_the_loss_is_least_at_the_truth_and_where_the_sigma_is_the_error() -> No
     sigma = torch.full_like(wanted, -2.0)
     right = fusion_loss(wanted, sigma, wanted, known)
     assert right < fusion_loss(wanted + 0.1, sigma, wanted, known)
-    off = [fusion_loss(wanted + 0.2, torch.full_like(wanted, log), wanted, known) for log in np.log([0.1, 0.2, 0.4])]
+    off = [
+        fusion_loss(wanted + 0.2, torch.full_like(wanted, log), wanted, known)
+        for log in np.log([0.1, 0.2, 0.4])
+    ]
     assert off[1] < min(off[0], off[2])
     sky = torch.zeros_like(known)
     farther = fusion_loss(wanted - 1, sigma, wanted, sky)
-    assert farther == fusion_loss(wanted - 2, sigma, wanted, sky) < fusion_loss(wanted + 1, sigma, wanted, sky)
+    assert (
+        farther
+        == fusion_loss(wanted - 2, sigma, wanted, sky)
+        < fusion_loss(wanted + 1, sigma, wanted, sky)
+    )
 
 
 @pytest.mark.slow
@@ -55,15 +64,52 @@ def test_a_network_is_trained_on_worlds_and_refines_a_run(
     monkeypatch.setattr(FusionNet, "forward", recorded)
     monkeypatch.setattr(torch.cpu, "get_capabilities", dict)
     for seed in (3, 4):
-        simulate = ["simulate", str(tmp_path / f"{seed}"), "--seed", str(seed), "--frames", "20", "--route", "grid"]
-        subprocess.run([sys.executable, "-m", "slam", *simulate, "--depth"], check=True, capture_output=True)
+        simulate = [
+            "simulate",
+            str(tmp_path / f"{seed}"),
+            "--seed",
+            str(seed),
+            "--frames",
+            "20",
+            "--route",
+            "grid",
+        ]
+        subprocess.run(
+            [sys.executable, "-m", "slam", *simulate, "--depth"], check=True, capture_output=True
+        )
     roots = ["--dataset", tmp_path / "3", "--validation", tmp_path / "4"]
-    words = ["train-fusion", *roots, "--output", tmp_path / "net", "--weights", "sim", "--samples", 80, "--steps", 20]
+    words = [
+        "train-fusion",
+        *roots,
+        "--output",
+        tmp_path / "net",
+        "--weights",
+        "sim",
+        "--samples",
+        80,
+        "--steps",
+        20,
+    ]
     code, out, _ = command_line(main, "erfsfm", *words, "--json")
     (metrics,) = json.loads(out)
     assert code == 0 and metrics["fused_mean"] < metrics["guess_mean"]
     assert in_bfloat16 == {False}
-    run = ["run", "--dataset", str(tmp_path / "4"), "--weights", "sim", "--set", f"depth.fusion={tmp_path / 'net'}"]
-    done = subprocess.run([sys.executable, "-m", "slam", *run, "--output", str(tmp_path / "run")], capture_output=True)
+    run = [
+        "run",
+        "--dataset",
+        str(tmp_path / "4"),
+        "--weights",
+        "sim",
+        "--set",
+        f"depth.fusion={tmp_path / 'net'}",
+    ]
+    done = subprocess.run(
+        [sys.executable, "-m", "slam", *run, "--output", str(tmp_path / "run")], capture_output=True
+    )
     assert done.returncode == 0, done.stderr
-    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["depth"]["refined"]["median_rel"] < 0.5
+    assert (
+        json.loads((tmp_path / "run" / "metrics.json").read_text())["depth"]["refined"][
+            "median_rel"
+        ]
+        < 0.5
+    )

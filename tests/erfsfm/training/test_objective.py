@@ -63,13 +63,22 @@ def batch(plane) -> SnippetBatch:
 
     target = tensor((0, 0, 0))[None].expand(2, -1, -1, -1)
     sources = torch.stack([tensor(place) for place in PLACES])[None].expand(2, -1, -1, -1, -1)
-    return SnippetBatch(target, sources, torch.from_numpy(plane.camera.K)[None].double().expand(2, 3, 3))
+    return SnippetBatch(
+        target, sources, torch.from_numpy(plane.camera.K)[None].double().expand(2, 3, 3)
+    )
 
 
 def evaluate(
-    batch: SnippetBatch, config: ExperimentConfig, disparity: float, vectors: Tensor, levels: int = 4
+    batch: SnippetBatch,
+    config: ExperimentConfig,
+    disparity: float,
+    vectors: Tensor,
+    levels: int = 4,
 ) -> ObjectiveResult:
-    depth_net, pose_net = FixedDepth(disparity, levels).requires_grad_(False), FixedPose(vectors).requires_grad_(False)
+    depth_net, pose_net = (
+        FixedDepth(disparity, levels).requires_grad_(False),
+        FixedPose(vectors).requires_grad_(False),
+    )
     return evaluate_objective(depth_net, pose_net, batch, config)
 
 
@@ -94,7 +103,9 @@ def test_the_true_depth_and_motion_have_the_least_loss(
         assert float(outcome.total) > 2 * truth, name
 
 
-def test_networks_get_the_weather_and_the_error_is_of_the_clear_images(batch: SnippetBatch, plane) -> None:
+def test_networks_get_the_weather_and_the_error_is_of_the_clear_images(
+    batch: SnippetBatch, plane
+) -> None:
     seen: list[Tensor] = []
 
     class Watching(FixedDepth):
@@ -122,7 +133,9 @@ def test_gradient_points_towards_truth(batch: SnippetBatch, plane, reduction: st
     for factor in (0.9, 1.1):
         depth_net = FixedDepth(factor / plane.distance)
         pose_net = FixedPose(factor * true_poses())
-        evaluate_objective(depth_net, pose_net, batch, experiment(reduction=reduction)).total.backward()
+        evaluate_objective(
+            depth_net, pose_net, batch, experiment(reduction=reduction)
+        ).total.backward()
         assert depth_net.disparity.grad is not None
         assert pose_net.vectors.grad is not None
         assert float(depth_net.disparity.grad) * (factor - 1) > 0
@@ -170,9 +183,16 @@ def naive_photometric(batch: SnippetBatch, disparities: list[Tensor], vectors: n
 
 def test_mean_is_the_papers_formula() -> None:
     generator = torch.Generator().manual_seed(5)
-    disparities = [torch.rand(2, 1, 32 >> s, 40 >> s, generator=generator).double() * 0.2 + 0.1 for s in range(4)]
-    vectors = torch.tensor([[0.4, -0.2, 0.5, 0.02, -0.05, 0.03], [-0.6, 0.1, -0.7, -0.02, 0.04, 0.1]]).double()
-    K = torch.tensor([[[35.0, 0, 19], [0, 33, 17], [0, 0, 1]], [[45.0, 0, 21], [0, 44, 15], [0, 0, 1]]]).double()
+    disparities = [
+        torch.rand(2, 1, 32 >> s, 40 >> s, generator=generator).double() * 0.2 + 0.1
+        for s in range(4)
+    ]
+    vectors = torch.tensor(
+        [[0.4, -0.2, 0.5, 0.02, -0.05, 0.03], [-0.6, 0.1, -0.7, -0.02, 0.04, 0.1]]
+    ).double()
+    K = torch.tensor(
+        [[[35.0, 0, 19], [0, 33, 17], [0, 0, 1]], [[45.0, 0, 21], [0, 44, 15], [0, 0, 1]]]
+    ).double()
     images = torch.rand(2, 3, 3, 32, 40, generator=generator).double()
     batch = SnippetBatch(images[:, 0], images[:, 1:], K)
 
@@ -180,10 +200,14 @@ def test_mean_is_the_papers_formula() -> None:
         def forward(self, image: Tensor) -> list[Tensor]:
             return disparities
 
-    outcome = evaluate_objective(Given(), FixedPose(vectors).requires_grad_(False), batch, experiment(fidelity="paper"))
+    outcome = evaluate_objective(
+        Given(), FixedPose(vectors).requires_grad_(False), batch, experiment(fidelity="paper")
+    )
     expected = naive_photometric(batch, disparities, vectors.numpy())
     assert float(outcome.terms["photometric"]) == pytest.approx(expected, rel=1e-9)
-    assert float(outcome.total) == pytest.approx(expected, rel=1e-9), "smoothness has no weight here"
+    assert float(outcome.total) == pytest.approx(expected, rel=1e-9), (
+        "smoothness has no weight here"
+    )
 
 
 def test_a_row_of_the_paper_weighs_its_terms_as_the_reference_does() -> None:
@@ -191,13 +215,18 @@ def test_a_row_of_the_paper_weighs_its_terms_as_the_reference_does() -> None:
 
     class Parabola(nn.Module):
         def forward(self, image: Tensor) -> list[Tensor]:
-            return [1 / (torch.arange(64 >> s) ** 2 + 1).double().expand(1, 1, 32 >> s, 64 >> s) for s in range(4)]
+            return [
+                1 / (torch.arange(64 >> s) ** 2 + 1).double().expand(1, 1, 32 >> s, 64 >> s)
+                for s in range(4)
+            ]
 
     K = torch.tensor([[[40.0, 0, 32], [0, 40, 16], [0, 0, 1]]]).double()
     images = torch.full((1, 5, 3, 32, 64), 0.5).double()
     batch = SnippetBatch(torch.full((1, 3, 32, 64), 0.3).double(), images[:, 1:], K)
     still = FixedPose(torch.zeros(4, 6).double()).requires_grad_(False)
-    outcome = evaluate_objective(Parabola(), still, batch, load_experiment("table1-posenet-416x128"))
+    outcome = evaluate_objective(
+        Parabola(), still, batch, load_experiment("table1-posenet-416x128")
+    )
     smoothness = 2 * (1 + 1 / 2 + 1 / 4 + 1 / 8)
     assert float(outcome.total) == pytest.approx(0.4 * 4 * 4 + 0.2 * smoothness)
 
@@ -249,10 +278,14 @@ def test_the_mask_keeps_what_moves(batch: SnippetBatch, plane) -> None:
     depth_net = FixedDepth(1.1 / plane.distance)
     evaluate_objective(depth_net, FixedPose(true_poses()), half_still, config).total.backward()
     assert depth_net.disparity.grad is not None
-    assert float(depth_net.disparity.grad) > 0, "the moving half still gives a gradient towards larger depth"
+    assert float(depth_net.disparity.grad) > 0, (
+        "the moving half still gives a gradient towards larger depth"
+    )
     plain = evaluate(half_still, experiment(reduction="mean"), 1 / plane.distance, true_poses())
     masked = evaluate(half_still, config, 1 / plane.distance, true_poses())
-    assert float(masked.total) < 0.3 * float(plain.total), "the still half adds no error at the true depth"
+    assert float(masked.total) < 0.3 * float(plain.total), (
+        "the still half adds no error at the true depth"
+    )
 
 
 def test_autocast_does_not_reach_the_geometry(plane, batch: SnippetBatch) -> None:
@@ -284,19 +317,29 @@ def _taught(views: str = "many", networks: str = "both", **loss: Any) -> Experim
 
 
 @pytest.mark.parametrize("views", ["exact", "many"])
-def test_labels_have_one_unit_that_depth_and_motion_must_have(batch: SnippetBatch, views: str) -> None:
-    vectors = torch.tensor([[0.3, 0.0, -0.1, 0.0, 0.1, 0.0], [-0.3, 0.0, 0.1, 0.0, -0.1, 0.0]]).double()
+def test_labels_have_one_unit_that_depth_and_motion_must_have(
+    batch: SnippetBatch, views: str
+) -> None:
+    vectors = torch.tensor(
+        [[0.3, 0.0, -0.1, 0.0, 0.1, 0.0], [-0.3, 0.0, 0.1, 0.0, -0.1, 0.0]]
+    ).double()
     height, width = batch.target.shape[-2:]
     half = torch.full((2, 1, height, width), 0.5).double()
-    T_source_target = pose_vector_to_matrix(vectors * torch.tensor([10.0] * 3 + [1] * 3))[None].expand(2, 2, 4, 4)
+    T_source_target = pose_vector_to_matrix(vectors * torch.tensor([10.0] * 3 + [1] * 3))[
+        None
+    ].expand(2, 2, 4, 4)
     right = replace(batch, T_source_target=T_source_target, bounds=(0.098 * half, 0.102 * half))
     assert evaluate(right, _taught(views), 0.5, vectors).total.item() == pytest.approx(0, abs=1e-3)
     for term, vector in {"translation": vectors * 2, "rotation": -vectors}.items():
         assert evaluate(right, _taught(views), 0.5, vector).terms[term].item() > 0.1
     twice = evaluate(right, _taught(views), 1.0, vectors)
     middle, half_width = math.sqrt(0.098 * 0.102), math.log(0.102 / 0.098) / 2
-    assert twice.terms["structure"].item() == pytest.approx(math.log(0.2 / middle) - half_width / 2, rel=1e-3)
-    assert twice.terms["translation"].item() == pytest.approx(0, abs=1e-3)  # the unit is not the depth's
+    assert twice.terms["structure"].item() == pytest.approx(
+        math.log(0.2 / middle) - half_width / 2, rel=1e-3
+    )
+    assert twice.terms["translation"].item() == pytest.approx(
+        0, abs=1e-3
+    )  # the unit is not the depth's
 
 
 def test_many_views_warp_the_images_by_the_measured_motion(batch: SnippetBatch, plane) -> None:
@@ -306,6 +349,14 @@ def test_many_views_warp_the_images_by_the_measured_motion(batch: SnippetBatch, 
     unbounded = (torch.zeros(shape).double(), torch.full(shape, torch.inf).double())
     labelled = replace(batch, T_source_target=T_source_target, bounds=unbounded)
     config = _taught("many", "depth", photometric_weight=1)
-    right = evaluate(labelled, config, 1 / plane.distance, torch.zeros(2, 6).double()).terms["photometric"].item()
-    wrong = evaluate(labelled, config, 1.3 / plane.distance, torch.zeros(2, 6).double()).terms["photometric"].item()
+    right = (
+        evaluate(labelled, config, 1 / plane.distance, torch.zeros(2, 6).double())
+        .terms["photometric"]
+        .item()
+    )
+    wrong = (
+        evaluate(labelled, config, 1.3 / plane.distance, torch.zeros(2, 6).double())
+        .terms["photometric"]
+        .item()
+    )
     assert right < 0.5 * wrong

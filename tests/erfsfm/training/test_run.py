@@ -56,7 +56,11 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def world(drives: Path, write_root: Callable[..., Path]) -> Path:
     """A drive of 10 frames with depth and poses."""
-    return drives / "world" if (drives / "world").exists() else write_root(drives / "world", frames=10, depth=True)
+    return (
+        drives / "world"
+        if (drives / "world").exists()
+        else write_root(drives / "world", frames=10, depth=True)
+    )
 
 
 @pytest.fixture
@@ -89,18 +93,25 @@ def both(small: Small, world: Path, held_out: Path) -> Configure:
 
 def weights_of(folder: Path) -> list[Tensor]:
     model = load_model(folder)
-    return [*model.networks["depth"].state_dict().values(), *model.networks["pose"].state_dict().values()]
+    return [
+        *model.networks["depth"].state_dict().values(),
+        *model.networks["pose"].state_dict().values(),
+    ]
 
 
 def same(first: Path, second: Path) -> bool:
-    return all(torch.equal(a, b) for a, b in zip(weights_of(first), weights_of(second), strict=True))
+    return all(
+        torch.equal(a, b) for a, b in zip(weights_of(first), weights_of(second), strict=True)
+    )
 
 
 class Interrupt(Exception):
     """A power cut."""
 
 
-def interrupted(monkeypatch: pytest.MonkeyPatch, config: ExperimentConfig, output: Path, step: int) -> None:
+def interrupted(
+    monkeypatch: pytest.MonkeyPatch, config: ExperimentConfig, output: Path, step: int
+) -> None:
     """The process dies in the midst of the step after ``step`` steps."""
     original = SelfSupervision.training_step
 
@@ -182,7 +193,9 @@ def test_resume_ends_with_identical_weights(
     records = [load_model(tmp_path / name / "last").record for name in ("whole", "cut")]
     assert records[0].metrics == records[1].metrics
     assert records[0].step == records[1].step == 6
-    assert (tmp_path / "cut" / "logs" / "csv" / "metrics.csv").is_file(), "the log before the interruption stays"
+    assert (tmp_path / "cut" / "logs" / "csv" / "metrics.csv").is_file(), (
+        "the log before the interruption stays"
+    )
     assert (tmp_path / "cut" / "logs" / "csv_from_4" / "metrics.csv").is_file()
 
 
@@ -193,11 +206,15 @@ def test_the_average_of_the_weights_is_what_is_measured_and_written(
     def steps_of(name: str, **training: Any) -> Path:
         return train(both(training=training), tmp_path / name, device="cpu") / "last"
 
-    first, second, third = (weights_of(steps_of(str(steps), steps=steps, validate_every=9)) for steps in (1, 2, 3))
+    first, second, third = (
+        weights_of(steps_of(str(steps), steps=steps, validate_every=9)) for steps in (1, 2, 3)
+    )
     expected = [a / 4 + b / 4 + c / 2 for a, b, c in zip(first, second, third, strict=True)]
     averaged = steps_of("averaged", steps=3, average_decay=0.5, validate_every=1)
     torch.testing.assert_close(weights_of(averaged), expected)
-    still = both(training={"steps": 1, "learning_rate": 1e-12}).model_copy(update={"initial_weights": str(averaged)})
+    still = both(training={"steps": 1, "learning_rate": 1e-12}).model_copy(
+        update={"initial_weights": str(averaged)}
+    )
     again = load_model(train(still, tmp_path / "still", device="cpu")).record.metrics
     assert load_model(averaged).record.metrics == pytest.approx(again, rel=1e-4)
     config = both(training={"steps": 5, "validate_every": 4, "average_decay": 0.5})
@@ -205,7 +222,9 @@ def test_the_average_of_the_weights_is_what_is_measured_and_written(
     torch.testing.assert_close(weights_of(tmp_path / "cut" / "last"), expected)
 
 
-def test_a_folder_that_another_training_writes_to_is_refused(alone: Configure, tmp_path: Path) -> None:
+def test_a_folder_that_another_training_writes_to_is_refused(
+    alone: Configure, tmp_path: Path
+) -> None:
     with FolderLock() as lock:
         lock.take(tmp_path / "run")
         with pytest.raises(BusyError, match="run"):
@@ -226,7 +245,9 @@ def scripted_validation(monkeypatch: pytest.MonkeyPatch, name: str, values: list
 def poses_measured(world: Path, folder: Path) -> dict[str, Any]:
     """Settings of a teacher that has measured the poses of the drive of 10 frames."""
     (recording,) = discover(world)
-    ManyViewTeacher(folder / "measured", (32, 64), 2).drive(recording).keep_poses(np.stack([np.eye(4)] * 10))
+    ManyViewTeacher(folder / "measured", (32, 64), 2).drive(recording).keep_poses(
+        np.stack([np.eye(4)] * 10)
+    )
     return {"views": "many", "rotation_weight": 1.0, "cache": folder / "measured"}
 
 
@@ -247,17 +268,28 @@ def saved(config: ExperimentConfig, networks: TrainedNetworks, folder: Path) -> 
     ],
 )
 def test_best_depth_and_best_pose_are_kept_apart(
-    both: Configure, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, networks: str, steps: dict[str, int]
+    both: Configure,
+    world: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    networks: str,
+    steps: dict[str, int],
 ) -> None:
-    scripted_validation(monkeypatch, "abs_rel", [0.3, 0.2, 0.5, 0.4] if networks != "pose" else [0.3] * 4)
+    scripted_validation(
+        monkeypatch, "abs_rel", [0.3, 0.2, 0.5, 0.4] if networks != "pose" else [0.3] * 4
+    )
     scripted_validation(monkeypatch, "snippet_ate", [0.05, math.nan, 0.01, 0.02])
     teacher = poses_measured(world, tmp_path) if networks == "pose" else {}
     training = {"validate_every": 1, "networks": networks}
     config = both(training=training, teacher=teacher)
     if networks == "depth":
-        config = config.model_copy(update={"initial_weights": str(saved(config, "both", tmp_path / "initial"))})
+        config = config.model_copy(
+            update={"initial_weights": str(saved(config, "both", tmp_path / "initial"))}
+        )
     output = train(config, tmp_path / "run", device="cpu")
-    written = [name for name in (".", "best_pose", "last") if (output / name / "model.yaml").exists()]
+    written = [
+        name for name in (".", "best_pose", "last") if (output / name / "model.yaml").exists()
+    ]
     assert {name: load_model(output / name).record.step for name in written} == steps
 
 
@@ -273,7 +305,9 @@ class Clock:
             return original(module, batch, index)
 
         monkeypatch.setattr(SelfSupervision, "training_step", timed)
-        monkeypatch.setattr("lightning.pytorch.callbacks.timer.time", SimpleNamespace(monotonic=lambda: self.now))
+        monkeypatch.setattr(
+            "lightning.pytorch.callbacks.timer.time", SimpleNamespace(monotonic=lambda: self.now)
+        )
 
 
 @pytest.mark.slow
@@ -282,12 +316,21 @@ def test_a_time_limit_ends_a_run_with_its_schedule_also_after_a_resume(
 ) -> None:
     """Three seconds, at a second a step, are three steps, whatever the number of steps allowed."""
     roots = [world, held_out]
-    three = configure(small, roots, training={"steps": 3, "schedule": "cosine", "validate_every": 100})
-    timed = configure(small, roots, training={**three.training.model_dump(), "steps": 1000, "minutes": 0.05})
+    three = configure(
+        small, roots, training={"steps": 3, "schedule": "cosine", "validate_every": 100}
+    )
+    timed = configure(
+        small, roots, training={**three.training.model_dump(), "steps": 1000, "minutes": 0.05}
+    )
     train(three, tmp_path / "three", device="cpu")
     Clock(monkeypatch)
     told: list[tuple[int, int]] = []
-    train(timed, tmp_path / "timed", device="cpu", progress=lambda stage, done, total: told.append((done, total)))
+    train(
+        timed,
+        tmp_path / "timed",
+        device="cpu",
+        progress=lambda stage, done, total: told.append((done, total)),
+    )
     assert told == [(1, 3), (2, 3), (3, 3)], "of the steps that there is time for"
     record = load_model(tmp_path / "timed" / "last").record
     assert record.step == 3 and "abs_rel" in record.metrics, "the end is validated"
@@ -320,8 +363,12 @@ def test_initial_weights_pass_on_their_leak_record_and_the_size_of_single_images
 ) -> None:
     first = train(alone(training={"steps": 1}), tmp_path / "first", device="cpu")
     larger, model = DepthInput(height=64, width=208, disparity=0.8), load_model(first)
-    save_model(first, replace(model, record=model.record.model_copy(update={"depth_input": larger})))
-    config = configure(small, [held_out], data={"validation": []}).model_copy(update={"initial_weights": str(first)})
+    save_model(
+        first, replace(model, record=model.record.model_copy(update={"depth_input": larger}))
+    )
+    config = configure(small, [held_out], data={"validation": []}).model_copy(
+        update={"initial_weights": str(first)}
+    )
     gentle = config.training.model_copy(update={"learning_rate": 1e-12})
     config = config.model_copy(update={"training": gentle})
     interrupted(monkeypatch, config, tmp_path / "second", 3)
@@ -339,10 +386,15 @@ def test_resume_with_other_data_keeps_the_leak_record(
     interrupted(monkeypatch, alone(), tmp_path / "run", 3)
     other = configure(small, [held_out], data={"validation": []})
     train(other, tmp_path / "run", resume=True, device="cpu")
-    assert load_model(tmp_path / "run").record.trained_on == ["simulated/500", "kitti_odometry/00[0:10]"]
+    assert load_model(tmp_path / "run").record.trained_on == [
+        "simulated/500",
+        "kitti_odometry/00[0:10]",
+    ]
 
 
-def test_a_non_finite_loss_stops_the_run(alone: Configure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_non_finite_loss_stops_the_run(
+    alone: Configure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     original = SelfSupervision.training_step
 
     def poisoned(self: SelfSupervision, batch: dict[str, Tensor], index: int) -> Tensor:
@@ -453,7 +505,9 @@ def refused_checkpoint(cut: tuple[ExperimentConfig, Path]) -> None:
 
 
 @pytest.mark.parametrize("kind", ["torch", "pickle"])
-def test_code_in_a_checkpoint_never_runs(cut: tuple[ExperimentConfig, Path], tmp_path: Path, kind: str) -> None:
+def test_code_in_a_checkpoint_never_runs(
+    cut: tuple[ExperimentConfig, Path], tmp_path: Path, kind: str
+) -> None:
     path = cut[1] / "checkpoints" / "last.ckpt"
     state = torch.load(path, weights_only=True) | {"extra": Malicious(tmp_path / "executed")}
     if kind == "torch":
@@ -505,7 +559,10 @@ def test_two_processes_are_one_with_twice_the_batch(both: Configure, tmp_path: P
     script.write_text(SCRIPT)
 
     def run(name: str, *resume: str, **training: Any) -> None:
-        config, output = both(training={"average_decay": 0.5} | training, data={"workers": 1}), tmp_path / name
+        config, output = (
+            both(training={"average_decay": 0.5} | training, data={"workers": 1}),
+            tmp_path / name,
+        )
         output.with_suffix(".yaml").write_text(dump_yaml(config))
         command = [sys.executable, script, output.with_suffix(".yaml"), output, *resume]
         done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
@@ -514,11 +571,15 @@ def test_two_processes_are_one_with_twice_the_batch(both: Configure, tmp_path: P
 
     run("one", batch=4)
     run("two", batch=2, devices=2)
-    for one, two in zip(weights_of(tmp_path / "one" / "last"), weights_of(tmp_path / "two" / "last"), strict=True):
+    for one, two in zip(
+        weights_of(tmp_path / "one" / "last"), weights_of(tmp_path / "two" / "last"), strict=True
+    ):
         torch.testing.assert_close(one, two, rtol=0, atol=1e-5)
     records = [load_model(tmp_path / name / "last").record for name in ("one", "two")]
     assert records[0].metrics == pytest.approx(records[1].metrics, rel=1e-4, abs=1e-7)
     run("two", "--resume", batch=2, steps=6, devices=2)
     run("one", "--resume", batch=4, steps=6)
-    for one, two in zip(weights_of(tmp_path / "one" / "last"), weights_of(tmp_path / "two" / "last"), strict=True):
+    for one, two in zip(
+        weights_of(tmp_path / "one" / "last"), weights_of(tmp_path / "two" / "last"), strict=True
+    ):
         torch.testing.assert_close(one, two, rtol=0, atol=1e-4)  # Adam divides by small moments

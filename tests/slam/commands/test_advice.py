@@ -43,7 +43,11 @@ def rows_of_other_frames(folder: Path) -> Case:
         (run,) = compare([("ours", estimate)], truth, frames="5:15")
         assert run.errors.align.none.ate_rmse_m == 0
 
-    return lambda: compare([("ours", estimate)], truth), r"give .* with --frames A:B and --reference", follow
+    return (
+        lambda: compare([("ours", estimate)], truth),
+        r"give .* with --frames A:B and --reference",
+        follow,
+    )
 
 
 def rate_of_another_video(folder: Path) -> Case:
@@ -58,7 +62,11 @@ def rate_of_another_video(folder: Path) -> Case:
         camera.write_text(camera.read_text().replace("fps: 25", f"fps: {advice[1]}"))
         np.testing.assert_allclose(open_sequence(video).stamps, 0.1 * np.arange(5))
 
-    return lambda: open_sequence(video), r"has (\S+) frames a second, .*: taken as even .*; correct fps", follow
+    return (
+        lambda: open_sequence(video),
+        r"has (\S+) frames a second, .*: taken as even .*; correct fps",
+        follow,
+    )
 
 
 def every_frame_of_a_camera(folder: Path) -> Case:
@@ -70,10 +78,16 @@ def every_frame_of_a_camera(folder: Path) -> Case:
     def follow(_: re.Match[str]) -> None:
         assert len(list(StreamedSequence("door", source, camera, 0.2).frames())) == 1
 
-    return (lambda: StreamedSequence("door", source, camera, 0.2, every_frame=True), "leave out --every-frame", follow)
+    return (
+        lambda: StreamedSequence("door", source, camera, 0.2, every_frame=True),
+        "leave out --every-frame",
+        follow,
+    )
 
 
-@pytest.mark.parametrize("case", [decimal_commas, rows_of_other_frames, rate_of_another_video, every_frame_of_a_camera])
+@pytest.mark.parametrize(
+    "case", [decimal_commas, rows_of_other_frames, rate_of_another_video, every_frame_of_a_camera]
+)
 def test_advice_that_is_followed_helps(
     case: Callable[[Path], Case], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

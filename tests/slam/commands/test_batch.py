@@ -17,12 +17,27 @@ from pathlib import Path
 
 import pytest
 
-from slam.commands.batch import Drive, Outcome, check_output, drives_of, run_drive, run_drives, spread
+from slam.commands.batch import (
+    Drive,
+    Outcome,
+    check_output,
+    drives_of,
+    run_drive,
+    run_drives,
+    spread,
+)
 from slam.commands.cli import main
 from slam.runtime.errors import RunError, SequenceError
 
 CommandLine = Callable[..., tuple[int, str, str]]
-QUICK = ["--set", "mapping.enabled=false", "--set", "visual_odometry.enabled=false", "--set", "output.report=false"]
+QUICK = [
+    "--set",
+    "mapping.enabled=false",
+    "--set",
+    "visual_odometry.enabled=false",
+    "--set",
+    "output.report=false",
+]
 
 UNITS_WITHOUT_METRES = ("camera heights", "the networks' own unit")
 
@@ -38,7 +53,16 @@ def test_a_manifest_names_drives(tmp_path: Path) -> None:
     )
     found = drives_of(manifest, ["all"], ["--seed", "3"])
     assert [drive.name for drive in found] == ["09", "walk", "walk-2"]
-    assert found[0].arguments == ("--dataset", "kitti", "--sequence", "09", "--seed", "3", "--frames", "0:90")
+    assert found[0].arguments == (
+        "--dataset",
+        "kitti",
+        "--sequence",
+        "09",
+        "--seed",
+        "3",
+        "--frames",
+        "0:90",
+    )
     assert {drive.folder for drive in found} == {tmp_path}
 
 
@@ -71,7 +95,9 @@ def test_wrong_options_of_all_drives_are_refused_before_anything_is_written(
 ) -> None:
     manifest, output = tmp_path / "drives.csv", tmp_path / "out"
     manifest.write_text("dataset\na\nb\n")
-    code, _, err = command_line(main, "erfsfm-slam", "batch", manifest, "--output", output, *words.split())
+    code, _, err = command_line(
+        main, "erfsfm-slam", "batch", manifest, "--output", output, *words.split()
+    )
     assert code == 1 and said in err and err.count("\n") == 1 and not output.exists()
 
 
@@ -85,11 +111,22 @@ def test_sequences_of_a_data_set(kitti_root: Path) -> None:
 
 
 @pytest.mark.slow
-def test_failures_are_told_apart_and_whole_runs_are_kept(kitti_root: Path, tiny_weights: Path, tmp_path: Path) -> None:
+def test_failures_are_told_apart_and_whole_runs_are_kept(
+    kitti_root: Path, tiny_weights: Path, tmp_path: Path
+) -> None:
     manifest, output = tmp_path / "drives.csv", tmp_path / "out"
     manifest.write_text(f"name,dataset\ngood,{kitti_root}\nbad,nowhere\n")
     words = [*QUICK, "--weights", str(tiny_weights), "--frames", "0:6"]
-    command = [sys.executable, "-m", "slam", "batch", str(manifest), "--output", str(output), *words]
+    command = [
+        sys.executable,
+        "-m",
+        "slam",
+        "batch",
+        str(manifest),
+        "--output",
+        str(output),
+        *words,
+    ]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
     assert "1 of 2 drives failed" in ended.stderr and "no data set at nowhere" in ended.stdout
@@ -99,15 +136,29 @@ def test_failures_are_told_apart_and_whole_runs_are_kept(kitti_root: Path, tiny_
     assert rows["bad"]["status"] == "failed" and "no data set at nowhere" in rows["bad"]["reason"]
     written = (output / "good" / "metrics.json").stat().st_mtime_ns
 
-    options = [*words[:6], "--weights", str(tiny_weights), "--frames", "0:6", "--seed", "0", "--device", "auto"]
+    options = [
+        *words[:6],
+        "--weights",
+        str(tiny_weights),
+        "--frames",
+        "0:6",
+        "--seed",
+        "0",
+        "--device",
+        "auto",
+    ]
     (good, _) = drives_of(manifest, ["all"], options)
     assert run_drive(good, output).status == "kept"
     assert (output / "good" / "metrics.json").stat().st_mtime_ns == written
 
 
-def test_a_drive_that_needs_too_much_memory_is_ended(kitti_root: Path, tiny_weights: Path, tmp_path: Path) -> None:
+def test_a_drive_that_needs_too_much_memory_is_ended(
+    kitti_root: Path, tiny_weights: Path, tmp_path: Path
+) -> None:
     """What an earlier run left, which was ended before its map, is no whole run."""
-    (sim,) = drives_of(kitti_root, ["all"], [*QUICK, "--weights", str(tiny_weights), "--frames", "0:6"])
+    (sim,) = drives_of(
+        kitti_root, ["all"], [*QUICK, "--weights", str(tiny_weights), "--frames", "0:6"]
+    )
     (tmp_path / "sim").mkdir()
     command = shlex.join(["erfsfm-slam", "run", *sim.arguments, "--output", str(tmp_path / "sim")])
     ended = {"status": "estimated", "provenance": {"command": command}}
@@ -119,17 +170,31 @@ def test_a_drive_that_needs_too_much_memory_is_ended(kitti_root: Path, tiny_weig
 
 
 def test_paths_of_the_command_line_are_seen_from_where_it_is_given(
-    kitti_root: Path, tiny_weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command_line: CommandLine
+    kitti_root: Path,
+    tiny_weights: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    command_line: CommandLine,
 ) -> None:
     here, data = tmp_path / "here", tmp_path / "data"
     shutil.copytree(tiny_weights, here / "mine")
     shutil.copytree(kitti_root, data / "root")
     quick = (
-        "mapping: {enabled: false}\nvisual_odometry: {enabled: false}\noutput: {report: false}\nscale: {mode: none}\n"
+        "mapping: {enabled: false}\nvisual_odometry: {enabled: false}\n"
+        "output: {report: false}\nscale: {mode: none}\n"
     )
     (here / "mine.yaml").write_text(quick + "depth: {frame_stride: 3}\n")
     (data / "mine.yaml").write_text(quick + "depth: {frame_stride: 7}\n")
-    words = ["batch", "../data/root", "--weights", "mine", "--config", "mine.yaml", "--frames", "0:6"]
+    words = [
+        "batch",
+        "../data/root",
+        "--weights",
+        "mine",
+        "--config",
+        "mine.yaml",
+        "--frames",
+        "0:6",
+    ]
     monkeypatch.chdir(here)
     code, out, err = command_line(main, "erfsfm-slam", *words, "--output", "out")
     assert code == 0, out + err
@@ -141,7 +206,9 @@ def test_paths_of_the_command_line_are_seen_from_where_it_is_given(
 
 
 @pytest.mark.parametrize("name", ["drives.csv", "sim.log"])
-def test_files_of_somebody_else_are_not_replaced(tmp_path: Path, kitti_root: Path, name: str) -> None:
+def test_files_of_somebody_else_are_not_replaced(
+    tmp_path: Path, kitti_root: Path, name: str
+) -> None:
     drives = drives_of(kitti_root, ["all"], [])
     check_output(tmp_path, drives)
     with pytest.raises(RunError, match=r"a drive is named drives\.csv"):
@@ -177,7 +244,9 @@ def test_a_drive_ends_with_its_worker(tmp_path: Path) -> None:
     """Its standard input is closed as by the death of the worker; else it would wait for images for an hour."""
     words = [str(tmp_path / "lock"), "live", "--dataset", str(tmp_path), "--wait", "3600"]
     command = [sys.executable, "-m", "slam.commands.batch", *words]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         while not (tmp_path / "lock").exists() and process.poll() is None:
             time.sleep(0.05)
         _, said = process.communicate(timeout=120)

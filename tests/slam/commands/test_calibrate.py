@@ -25,7 +25,12 @@ from slam.sequences.catalogue import open_sequence
 
 Call = Callable[..., tuple[int, str, str]]
 FISHEYE = {"model": "fisheye", "distortion": (-0.02, 0.01, -0.003, 0.0005)}
-CHARUCO = {"board": Board(9, 6, 0.03, "charuco"), "width": 480, "height": 360, "camera": (390.0, 394.0, 248.0, 175.0)}
+CHARUCO = {
+    "board": Board(9, 6, 0.03, "charuco"),
+    "width": 480,
+    "height": 360,
+    "camera": (390.0, 394.0, 248.0, 175.0),
+}
 _FINE = 2
 _TEXEL_PX = 24  # of the texture, a square
 _MARGIN = 1  # squares of white around the board
@@ -47,7 +52,9 @@ class Studio:
         fx, fy, cx, cy = self.camera
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
-    def picture(self, tilt_deg: tuple[float, float, float], place_m: tuple[float, float, float]) -> np.ndarray:
+    def picture(
+        self, tilt_deg: tuple[float, float, float], place_m: tuple[float, float, float]
+    ) -> np.ndarray:
         """The grey image of the board, turned about its middle, at a place before the camera."""
         R = Rotation.from_euler("xyz", tilt_deg, degrees=True).as_matrix()
         rays = rays_of(self.model, self.width, self.height, self.camera, self.distortion)
@@ -56,8 +63,14 @@ class Studio:
         along = rays @ R
         depth = (R[:, 2] @ t) / along[:, 2]
         squares = (along[:, :2] * depth[:, None] - t @ R[:, :2]) / self.board.square_m + 1 + _MARGIN
-        texels = (squares * _TEXEL_PX - 0.5).astype(np.float32).reshape(self.height * _FINE, self.width * _FINE, 2)
-        fine = cv2.remap(texture(self.board), texels[..., 0], texels[..., 1], cv2.INTER_LINEAR, borderValue=110)
+        texels = (
+            (squares * _TEXEL_PX - 0.5)
+            .astype(np.float32)
+            .reshape(self.height * _FINE, self.width * _FINE, 2)
+        )
+        fine = cv2.remap(
+            texture(self.board), texels[..., 0], texels[..., 1], cv2.INTER_LINEAR, borderValue=110
+        )
         return cv2.resize(fine, (self.width, self.height), interpolation=cv2.INTER_AREA)
 
 
@@ -83,7 +96,9 @@ def texture(board: Board) -> np.ndarray:
         inside = board.charuco().generateImage((columns * _TEXEL_PX, rows * _TEXEL_PX))
     else:
         row, column = np.mgrid[:rows, :columns]
-        inside = np.kron(255 * ((row + column) % 2).astype(np.uint8), np.ones((_TEXEL_PX,) * 2, np.uint8))
+        inside = np.kron(
+            255 * ((row + column) % 2).astype(np.uint8), np.ones((_TEXEL_PX,) * 2, np.uint8)
+        )
     return np.pad(inside, _MARGIN * _TEXEL_PX, constant_values=255)
 
 
@@ -96,7 +111,9 @@ def spread(count: int, steepest_deg: float, seed: int = 0, nearest_m: float = 0.
         tilt = steepest_deg * (0.4 + 0.6 * random.random())
         z = nearest_m + 0.15 * random.random()
         x, y = 0.26 * z * np.cos(2.4 * k), 0.16 * z * np.sin(2.4 * k)
-        views.append(((tilt * np.cos(turn), tilt * np.sin(turn), random.uniform(-20, 20)), (x, y, z)))
+        views.append(
+            ((tilt * np.cos(turn), tilt * np.sin(turn), random.uniform(-20, 20)), (x, y, z))
+        )
     return views
 
 
@@ -113,19 +130,27 @@ def write_views(folder: Path, studio: Studio, views: list[tuple]) -> Path:
 @pytest.fixture
 def calibrate(command_line: Call, tmp_path: Path) -> Call:
     """Exit code, stdout and stderr."""
-    return partial(command_line, main, "erfsfm-slam", "calibrate", "--output", tmp_path / "camera.yaml")
+    return partial(
+        command_line, main, "erfsfm-slam", "calibrate", "--output", tmp_path / "camera.yaml"
+    )
 
 
 def require_close(camera: CameraFile, studio: Studio) -> None:
     """Focal lengths within 0.5 %, the principal point within 0.5 % of the width, the lens within half a pixel."""
     K = studio.K
-    assert camera.fx == pytest.approx(K[0, 0], rel=0.005) and camera.fy == pytest.approx(K[1, 1], rel=0.005)
+    assert camera.fx == pytest.approx(K[0, 0], rel=0.005) and camera.fy == pytest.approx(
+        K[1, 1], rel=0.005
+    )
     assert (camera.cx, camera.cy) == pytest.approx((K[0, 2], K[1, 2]), abs=0.005 * studio.width)
-    grid = np.stack(np.meshgrid(np.linspace(-0.5, 0.5, 9), np.linspace(-0.38, 0.38, 7)), axis=-1).reshape(-1, 1, 2)
+    grid = np.stack(
+        np.meshgrid(np.linspace(-0.5, 0.5, 9), np.linspace(-0.38, 0.38, 7)), axis=-1
+    ).reshape(-1, 1, 2)
     points = np.concatenate([grid, np.ones_like(grid[..., :1])], axis=-1)
     project = cv2.fisheye.projectPoints if camera.model == "fisheye" else cv2.projectPoints
     zero = np.zeros(3)
-    found, _ = project(points, zero, zero, Intrinsics.of(camera.pinhole).K, np.array(camera.distortion))
+    found, _ = project(
+        points, zero, zero, Intrinsics.of(camera.pinhole).K, np.array(camera.distortion)
+    )
     true, _ = project(points, zero, zero, K, np.array(studio.distortion))
     assert np.abs(found - true).max() < 0.01 * studio.width
 
@@ -139,7 +164,9 @@ def require_close(camera: CameraFile, studio: Studio) -> None:
     ],
     ids=["opencv", "fisheye", "charuco"],
 )
-def test_a_known_camera_is_found(tmp_path: Path, calibrate: Call, lens: dict, options: list[str]) -> None:
+def test_a_known_camera_is_found(
+    tmp_path: Path, calibrate: Call, lens: dict, options: list[str]
+) -> None:
     studio = Studio(**lens)
     folder = write_views(tmp_path / "board", studio, spread(12, 40))
     code, out, err = calibrate(folder, "--board", "9x6", *options)
@@ -193,9 +220,17 @@ def test_a_video_gives_its_rate(tmp_path: Path, calibrate: Call) -> None:
 @pytest.mark.parametrize(
     "views, options, message",
     [
-        ("frontal", [], "all 9 views are frontal .*do not determine the focal length; tilt it by 20 to 45"),
+        (
+            "frontal",
+            [],
+            "all 9 views are frontal .*do not determine the focal length; tilt it by 20 to 45",
+        ),
         ("few", [], "3 of 3 images show the whole 9x6 chessboard, 8 are needed: take 20 or more"),
-        ("outside", [], "0 of 4 images show the whole 9x6 chessboard.*with all of the board in them"),
+        (
+            "outside",
+            [],
+            "0 of 4 images show the whole 9x6 chessboard.*with all of the board in them",
+        ),
         pytest.param(
             "tilted",
             ["--board", "8x6"],
@@ -204,8 +239,16 @@ def test_a_video_gives_its_rate(tmp_path: Path, calibrate: Call) -> None:
         ),
         ("far", [], "was seen in .* % of the image alone|leave the focal length uncertain"),
         ("tilted", ["--board", "nine"], "--board nine is no board"),
-        ("tilted", ["--pattern", "charuco", "--dictionary", "9X9_1"], "--dictionary 9X9_1 is none of OpenCV's"),
-        ("tilted", ["--pattern", "charuco", "--dictionary", "4X4_50", "--board", "19x9"], "has too few markers"),
+        (
+            "tilted",
+            ["--pattern", "charuco", "--dictionary", "9X9_1"],
+            "--dictionary 9X9_1 is none of OpenCV's",
+        ),
+        (
+            "tilted",
+            ["--pattern", "charuco", "--dictionary", "4X4_50", "--board", "19x9"],
+            "has too few markers",
+        ),
     ],
 )
 def test_what_does_not_determine_the_camera_is_refused(

@@ -29,7 +29,14 @@ Call = Callable[..., tuple[int, str, str]]
 MakeRun = Callable[..., RunFolder]
 
 VERBS = {"run", "evaluate", "export", "simulate", "localize", "config", "doctor"}
-QUICK = ("--set", "mapping.enabled=false", "--set", "visual_odometry.enabled=false", "--set", "output.report=false")
+QUICK = (
+    "--set",
+    "mapping.enabled=false",
+    "--set",
+    "visual_odometry.enabled=false",
+    "--set",
+    "output.report=false",
+)
 
 
 @pytest.fixture
@@ -59,14 +66,23 @@ assert not heavy, heavy
 
 
 def test_help_of_every_verb_is_light() -> None:
-    finished = subprocess.run([sys.executable, "-c", HELP], capture_output=True, text=True, check=False)
+    finished = subprocess.run(
+        [sys.executable, "-c", HELP], capture_output=True, text=True, check=False
+    )
     assert finished.returncode == 0, finished.stderr
     assert set(finished.stdout.split()) >= VERBS
 
 
 @pytest.mark.parametrize(
     "words",
-    ["", "fly", "run --seed -1", "evaluate a.txt b.txt c.txt", "evaluate . --fail-over a=1", "evaluate . --csv a"],
+    [
+        "",
+        "fly",
+        "run --seed -1",
+        "evaluate a.txt b.txt c.txt",
+        "evaluate . --fail-over a=1",
+        "evaluate . --csv a",
+    ],
 )
 def test_wrong_usage_exits_with_2(call: Call, words: str) -> None:
     code, out, err = call(*words.split())
@@ -84,7 +100,10 @@ def test_wrong_usage_exits_with_2(call: Call, words: str) -> None:
         (["run", "--frames", "9:3"], "A must come before B"),
         (["evaluate", "a.txt", "b.txt"], "b.txt: no such file"),
         (["evaluate", "."], "not a run folder"),
-        (["export", "nowhere", "--what", "mesh", "--output", "m.ply"], "nowhere is not a run folder"),
+        (
+            ["export", "nowhere", "--what", "mesh", "--output", "m.ply"],
+            "nowhere is not a run folder",
+        ),
         (["simulate", "world", "--route", "maze"], "maze"),
         (["simulate", "world", "--frames", "20"], "a loop closes within 250"),
     ],
@@ -98,8 +117,21 @@ def test_a_known_error_is_one_line_and_exits_with_1(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_run_prints_table_licence_and_place(call: Call, kitti_root: Path, tiny_weights: Path) -> None:
-    arguments = ["run", "--dataset", kitti_root, "-s", "sim", "--weights", tiny_weights, "--frames", "0:6", *QUICK]
+def test_run_prints_table_licence_and_place(
+    call: Call, kitti_root: Path, tiny_weights: Path
+) -> None:
+    arguments = [
+        "run",
+        "--dataset",
+        kitti_root,
+        "-s",
+        "sim",
+        "--weights",
+        tiny_weights,
+        "--frames",
+        "0:6",
+        *QUICK,
+    ]
     code, out, err = call(*arguments, "--output", "my run", "--set", "scale.mode=none", "--seed", 5)
     assert (code, err) == (0, "")
     for name in ("network", "odometry", "optimised"):
@@ -120,10 +152,14 @@ def test_run_prints_table_licence_and_place(call: Call, kitti_root: Path, tiny_w
     assert code == 0 and "scene" in out and len(list(Path("scene/images").iterdir())) == 6, err
 
 
-def test_run_prints_interpolated_gaps(call: Call, copy_of_kitti_root: Callable[[], Path], tiny_weights: Path) -> None:
+def test_run_prints_interpolated_gaps(
+    call: Call, copy_of_kitti_root: Callable[[], Path], tiny_weights: Path
+) -> None:
     root = copy_of_kitti_root()
     (root / "sequences" / "sim" / "image_2" / "000007.png").write_bytes(b"no image")
-    code, out, _ = call("run", "--dataset", root, "--weights", tiny_weights, "--output", "run", *QUICK)
+    code, out, _ = call(
+        "run", "--dataset", root, "--weights", tiny_weights, "--output", "run", *QUICK
+    )
     assert code == 0 and re.search(r"^INTERPOLATED: frames 7: .*000007\.png", out, re.MULTILINE)
 
 
@@ -132,13 +168,29 @@ def test_a_run_without_truth_has_no_table_of_dashes(
 ) -> None:
     root = copy_of_kitti_root()
     (root / "poses" / "sim.txt").unlink()
-    code, out, _ = call("run", "--dataset", root, "--weights", tiny_weights, "--set", "mapping.enabled=false")
-    assert code == 0 and "sim, scale camera-height: no errors, for the sequence has no true poses" in out
+    code, out, _ = call(
+        "run", "--dataset", root, "--weights", tiny_weights, "--set", "mapping.enabled=false"
+    )
+    assert (
+        code == 0
+        and "sim, scale camera-height: no errors, for the sequence has no true poses" in out
+    )
     assert "–" not in out and "14 frames in" in out
 
 
-def test_run_stamps_a_leak_and_prints_json(call: Call, kitti_root: Path, leaky_weights: Path) -> None:
-    arguments = ["run", "--dataset", kitti_root, "--weights", leaky_weights, "--frames", "0:6", *QUICK]
+def test_run_stamps_a_leak_and_prints_json(
+    call: Call, kitti_root: Path, leaky_weights: Path
+) -> None:
+    arguments = [
+        "run",
+        "--dataset",
+        kitti_root,
+        "--weights",
+        leaky_weights,
+        "--frames",
+        "0:6",
+        *QUICK,
+    ]
     assert "LEAK" in call(*arguments)[1]
     code, out, _ = call(*arguments, "--json", "--output", "again")
     assert code == 0 and json.loads(out) == RunFolder.open(Path("again")).metrics().tree()
@@ -162,7 +214,9 @@ def files_of(run: RunFolder, kind: str = "tum") -> tuple[Path, Path]:
 def test_evaluate_files(call: Call, make_run: MakeRun, kind: str) -> None:
     estimate, reference = files_of(make_run(), kind)
     code, out, _ = call("evaluate", estimate, reference, "--json")
-    expected = trajectory_metrics(read_trajectory(estimate, kind), read_trajectory(reference, kind)).tree()
+    expected = trajectory_metrics(
+        read_trajectory(estimate, kind), read_trajectory(reference, kind)
+    ).tree()
     assert code == 0 and json.loads(out) == expected
     code, table, _ = call("evaluate", estimate, reference, "--format", kind)
     assert code == 0
@@ -173,8 +227,15 @@ def test_evaluate_files(call: Call, make_run: MakeRun, kind: str) -> None:
 def test_fail_over(call: Call, make_run: MakeRun) -> None:
     files = files_of(make_run())
     assert call("evaluate", *files, "--fail-over", "ate_rmse_m=1000")[0] == 0
-    code, out, err = call("evaluate", *files, "--json", "--fail-over", "ate_rmse_m=0", "--fail-over", "rpe_rot_deg=99")
-    assert code == 1 and "align.7dof.ate_rmse_m is " in err and "over the limit 0" in err and "rpe_rot_deg" not in err
+    code, out, err = call(
+        "evaluate", *files, "--json", "--fail-over", "ate_rmse_m=0", "--fail-over", "rpe_rot_deg=99"
+    )
+    assert (
+        code == 1
+        and "align.7dof.ate_rmse_m is " in err
+        and "over the limit 0" in err
+        and "rpe_rot_deg" not in err
+    )
     assert json.loads(out)["align"]
     for limit, words in (("beauty=1", "no metric 'beauty'"), ("ate_rmse_m=few", "METRIC=VALUE")):
         code, _, err = call("evaluate", *files, "--fail-over", limit)
@@ -185,7 +246,9 @@ def test_evaluate_runs_side_by_side(call: Call, make_run: MakeRun) -> None:
     runs = [make_run(name).path for name in ("morning", "evening")]
     code, out, _ = call("evaluate", *runs)
     assert code == 0 and "morning" in out and "evening" in out and "optimised" in out
-    assert [entry["run"] for entry in json.loads(call("evaluate", *runs, "--json")[1])] == list(map(str, runs))
+    assert [entry["run"] for entry in json.loads(call("evaluate", *runs, "--json")[1])] == list(
+        map(str, runs)
+    )
 
 
 def test_evaluate_systems_against_one_reference(call: Call, make_run: MakeRun) -> None:
@@ -196,20 +259,37 @@ def test_evaluate_systems_against_one_reference(call: Call, make_run: MakeRun) -
         Path(f"orb_{k}.txt").write_text("".join(text[: len(text) // 2 if k == 2 else None]))
     truth = run.path / "reference.kitti.txt"
     rows = len(truth.read_text().splitlines())
-    code, out, err = call("evaluate", run.path, "orb=orb_[01].txt", "--reference", truth, "--csv", "a.csv")
+    code, out, err = call(
+        "evaluate", run.path, "orb=orb_[01].txt", "--reference", truth, "--csv", "a.csv"
+    )
     assert (code, err) == (0, "") and "orb (2 runs)" in out and " ± 0.000" in out
     lines = Path("a.csv").read_text().splitlines()
-    assert len(lines) == 4 and lines[0].startswith("system,path,poses,") and "align.6dof.t_rel_percent" in lines[0]
+    assert (
+        len(lines) == 4
+        and lines[0].startswith("system,path,poses,")
+        and "align.6dof.t_rel_percent" in lines[0]
+    )
     code, _, err = call("evaluate", "orb_2.txt", "--reference", truth)
     assert code == 1 and "orb_2.txt: the estimate has" in err and "--frames A:B" in err
-    arguments = ("evaluate", run.path, "orb_2.txt", "--reference", run.path, "--frames", f"0:{rows // 2}")
+    arguments = (
+        "evaluate",
+        run.path,
+        "orb_2.txt",
+        "--reference",
+        run.path,
+        "--frames",
+        f"0:{rows // 2}",
+    )
     code, out, _ = call(*arguments, "--json")
     assert code == 0 and [each["poses"] for each in json.loads(out)] == [rows // 2] * 2
     assert json.loads(out)[1]["align"]["7dof"]["ate_rmse_m"] == pytest.approx(
         json.loads(out)[0]["align"]["7dof"]["ate_rmse_m"]
     )
     assert call(*arguments, "--fail-over", "ate_rmse_m=0")[0] == 1
-    for words, wanted in ((("no=*.none",), "no file or folder is named *.none"), (("a.txt",), "a.txt: no such file")):
+    for words, wanted in (
+        (("no=*.none",), "no file or folder is named *.none"),
+        (("a.txt",), "a.txt: no such file"),
+    ):
         code, _, err = call("evaluate", *words, "--reference", truth)
         assert code == 1 and err.count("\n") == 1 and wanted in err
     code, _, err = call("evaluate", run.path, "--reference", truth, "--csv", "orb_0.txt")
@@ -237,25 +317,41 @@ def test_localize_prints_a_row_an_image(call: Call, kitti_root: Path, tiny_weigh
     assert call(*run)[0] == 0
     images = kitti_root / "sequences" / "sim" / "image_2"
     code, out, err = call("localize", images, "--map", "run", "--frames", "11:14")
-    assert (code, err) == (0, "") and "of 3 images found" in out and re.search(r"^\s*000013\.png ", out, re.MULTILINE)
+    assert (
+        (code, err) == (0, "")
+        and "of 3 images found" in out
+        and re.search(r"^\s*000013\.png ", out, re.MULTILINE)
+    )
     code, out, _ = call("localize", images / "000003.png", "--map", "run", "--json")
     assert code == 0 and [entry["image"] for entry in json.loads(out)] == ["000003.png"]
     assert call("localize", images, "--map", images)[0] == 1
     reference = Path("run/reference.tum.txt").read_bytes()
     code, _, err = call("localize", images, "--map", "run", "--output", "run/reference.tum.txt")
-    assert code == 1 and "is a file of a run" in err and Path("run/reference.tum.txt").read_bytes() == reference
+    assert (
+        code == 1
+        and "is a file of a run" in err
+        and Path("run/reference.tum.txt").read_bytes() == reference
+    )
 
 
 @pytest.mark.slow
 def test_simulate_writes_a_root_that_runs(call: Call, tiny_weights: Path) -> None:
     size = ("--width", 104, "--height", 32, "--frames", 8, "--route", "straight", "--seed", 1003)
-    code, out, err = call("simulate", "world", *size, "--depth", "--lidar", "--hazards", "rain,exposure")
+    code, out, err = call(
+        "simulate", "world", *size, "--depth", "--lidar", "--hazards", "rain,exposure"
+    )
     assert (code, err) == (0, "") and "--dataset world" in out
     sequence = Path("world/sequences/sim")
     assert len(list((sequence / "image_2").glob("*.png"))) == 8
     depth = cv2.imread(str(sequence / "depth_2" / "000003.png"), cv2.IMREAD_UNCHANGED)
-    assert depth.dtype == np.uint16 and depth.shape == (32, 104) and 2 < np.median(depth[20:] / 256) < 40
-    assert np.fromfile(sequence / "velodyne" / "000003.bin", np.float32).reshape(-1, 4).shape[0] > 1000
+    assert (
+        depth.dtype == np.uint16
+        and depth.shape == (32, 104)
+        and 2 < np.median(depth[20:] / 256) < 40
+    )
+    assert (
+        np.fromfile(sequence / "velodyne" / "000003.bin", np.float32).reshape(-1, 4).shape[0] > 1000
+    )
     assert np.loadtxt("world/poses/sim.txt").shape == (8, 12)
     assert call("simulate", "world", *size)[0] == 1  # never over what is there
     assert call("run", "--dataset", "world", "--weights", tiny_weights, *QUICK)[0] == 0

@@ -36,11 +36,15 @@ def test_packages_that_take_seconds_are_not_imported() -> None:
         "import sys; from slam.commands.doctor import examine; examine(None); "
         "print(*{'torch', 'lightning', 'evo', 'matplotlib', 'dash'} & set(sys.modules))"
     )
-    finished = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    finished = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
     assert finished.stdout.split() == []
 
 
-def test_weights_are_named_with_their_licence(monkeypatch: pytest.MonkeyPatch, tiny_weights: Path) -> None:
+def test_weights_are_named_with_their_licence(
+    monkeypatch: pytest.MonkeyPatch, tiny_weights: Path
+) -> None:
     monkeypatch.setattr(doctor, "WEIGHTS", ("nowhere", str(tiny_weights)))
     lines = examine(None)
     assert finding(lines, "weights nowhere").startswith("missing")
@@ -49,14 +53,18 @@ def test_weights_are_named_with_their_licence(monkeypatch: pytest.MonkeyPatch, t
 
 
 @pytest.mark.parametrize("how", ["IMPORTED", "LOOKED_UP"])
-def test_a_missing_package_comes_with_its_installation(monkeypatch: pytest.MonkeyPatch, how: str) -> None:
+def test_a_missing_package_comes_with_its_installation(
+    monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
     monkeypatch.setattr(doctor, how, {"no-such-package": "no_such_package"})
     line = finding(examine(None), "no-such-package:")
     assert line.startswith("missing") and "pip install" in line
 
 
 @pytest.mark.parametrize("by_variable", [False, True])
-def test_a_data_set_sequence_by_sequence(kitti_root: Path, by_variable: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_data_set_sequence_by_sequence(
+    kitti_root: Path, by_variable: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     if by_variable:
         monkeypatch.setenv("KITTI_ODOMETRY", str(kitti_root))
     line = finding(examine(None if by_variable else kitti_root), "sequence sim")

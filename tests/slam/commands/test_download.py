@@ -69,7 +69,9 @@ class Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
         with server.lock:
-            is_cut = server.cuts_left > 0 and len(server.asked) >= server.cut_from and len(body) > 500
+            is_cut = (
+                server.cuts_left > 0 and len(server.asked) >= server.cut_from and len(body) > 500
+            )
             server.cuts_left -= is_cut
             server.asked.append((self.path, len(body)))
         with suppress(BrokenPipeError, ConnectionResetError):
@@ -96,15 +98,25 @@ def picture(sequence: int, k: int) -> bytes:
 def server() -> Iterator[Server]:
     """KITTI's archives with sequences 08, 09 and 11."""
     home, names = "dataset/sequences", ("08", "09", "11")
-    images = {f"{home}/{s}/image_2/{k:06d}.png": picture(int(s), k) for s in names for k in range(FRAMES)}
-    bulk = {f"{home}/20/image_2/{k:06d}.png": np.random.default_rng(k).bytes(200_000) for k in range(3)}
+    images = {
+        f"{home}/{s}/image_2/{k:06d}.png": picture(int(s), k) for s in names for k in range(FRAMES)
+    }
+    bulk = {
+        f"{home}/20/image_2/{k:06d}.png": np.random.default_rng(k).bytes(200_000) for k in range(3)
+    }
     files = {
         "data_odometry_color.zip": zipped({f"{home}/09/image_2/": b"", **images, **bulk}),
         "data_odometry_gray.zip": zipped({f"{home}/09/image_0/000000.png": b"grey"}),
         "data_odometry_calib.zip": zipped(
-            {f"{home}/{s}/{file}": f"{s} {file}\n".encode() * 9 for s in names for file in ("calib.txt", "times.txt")}
+            {
+                f"{home}/{s}/{file}": f"{s} {file}\n".encode() * 9
+                for s in names
+                for file in ("calib.txt", "times.txt")
+            }
         ),
-        "data_odometry_poses.zip": zipped({f"dataset/poses/{s}.txt": b"1 0 0\n" for s in names[:2]}),
+        "data_odometry_poses.zip": zipped(
+            {f"dataset/poses/{s}.txt": b"1 0 0\n" for s in names[:2]}
+        ),
         "data_odometry_velodyne.zip": zipped({f"{home}/09/velodyne/000000.bin": b"1234" * 4}),
     }
     with Server() as running:
@@ -119,7 +131,15 @@ def download(command_line: Call, tmp_path: Path, server: Server) -> Call:
     """Exit code, stdout and stderr, which is one line at most."""
 
     def call(*arguments: str) -> tuple[int, str, str]:
-        words = ["erfsfm-slam", "download", "--to", tmp_path / "to", "--mirror", server.address, *arguments]
+        words = [
+            "erfsfm-slam",
+            "download",
+            "--to",
+            tmp_path / "to",
+            "--mirror",
+            server.address,
+            *arguments,
+        ]
         code, out, err = command_line(main, *words)
         assert len(err.splitlines()) <= 1, err
         return code, out, err
@@ -167,9 +187,10 @@ def test_what_is_there_is_not_fetched_again_and_what_is_damaged_is(
 
 def test_grey_images_scans_and_sequences_without_poses(tmp_path: Path, download: Call) -> None:
     assert download(*KITTI, "--camera", "grey", "--lidar")[0] == 0
-    assert {"dataset/sequences/09/image_0/000000.png", "dataset/sequences/09/velodyne/000000.bin"} <= found(
-        tmp_path / "to"
-    )
+    assert {
+        "dataset/sequences/09/image_0/000000.png",
+        "dataset/sequences/09/velodyne/000000.bin",
+    } <= found(tmp_path / "to")
     assert download("kitti-odometry", "-s", "11", "--accept-licence")[0] == 0
     assert "dataset/poses/11.txt" not in found(tmp_path / "to")
 
@@ -180,7 +201,9 @@ def test_one_that_keeps_breaking_is_named_and_goes_on_later(
 ) -> None:
     server.cuts_left, server.cut_from = 10**6, cut_from
     code, _, err = download(*KITTI)
-    assert code == 1 and re.search(r"(broke off|cannot be read) .*; run the same command again to go on", err)
+    assert code == 1 and re.search(
+        r"(broke off|cannot be read) .*; run the same command again to go on", err
+    )
     server.cuts_left = 0
     assert download(*KITTI)[0] == 0
     assert found(tmp_path / "to") == WHOLE
@@ -198,7 +221,9 @@ def test_no_server_at_all(download: Call, mirror: str, message: str) -> None:
     assert code == 1 and re.search(message, err) and len(err.splitlines()) == 1, err
 
 
-def test_bytes_that_do_not_fit_their_crc_are_not_kept(tmp_path: Path, server: Server, download: Call) -> None:
+def test_bytes_that_do_not_fit_their_crc_are_not_kept(
+    tmp_path: Path, server: Server, download: Call
+) -> None:
     data = server.files["data_odometry_color.zip"]
     start = data.index(b"dataset/sequences/09/image_2/000000.png") + 60
     server.files["data_odometry_color.zip"] = data[:start] + bytes(200) + data[start + 200 :]
@@ -207,14 +232,20 @@ def test_bytes_that_do_not_fit_their_crc_are_not_kept(tmp_path: Path, server: Se
     assert "dataset/sequences/09/image_2/000000.png" not in found(tmp_path / "to")
 
 
-def test_members_that_lead_out_of_the_folder_are_refused(tmp_path: Path, server: Server, download: Call) -> None:
-    server.files["data_odometry_color.zip"] = zipped({"dataset/sequences/09/image_2/../../../../../out.png": b"x"})
+def test_members_that_lead_out_of_the_folder_are_refused(
+    tmp_path: Path, server: Server, download: Call
+) -> None:
+    server.files["data_odometry_color.zip"] = zipped(
+        {"dataset/sequences/09/image_2/../../../../../out.png": b"x"}
+    )
     code, _, err = download(*KITTI)
     assert code == 1 and "outside of its folder" in err
     assert not (tmp_path / "out.png").exists() and not found(tmp_path / "to")
 
 
-def test_a_server_without_ranges_is_named_and_nothing_is_kept(tmp_path: Path, server: Server, download: Call) -> None:
+def test_a_server_without_ranges_is_named_and_nothing_is_kept(
+    tmp_path: Path, server: Server, download: Call
+) -> None:
     server.gives_ranges = False
     code, _, err = download(*KITTI)
     assert code == 1 and "gives no parts of files" in err and not found(tmp_path / "to")

@@ -23,7 +23,14 @@ import numpy as np
 import pytest
 
 from slam import run_slam
-from slam.commands.live import FolderSource, LiveRequest, StreamedSequence, VideoSource, open_source, run_live
+from slam.commands.live import (
+    FolderSource,
+    LiveRequest,
+    StreamedSequence,
+    VideoSource,
+    open_source,
+    run_live,
+)
 from slam.frames import Image
 from slam.runtime.errors import SequenceError, SlamError
 from slam.sequences.camera_file import explicit_camera
@@ -40,17 +47,32 @@ def street(kitti_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "images").mkdir()
     for path in images:
         shutil.copy(path, folder / "images" / path.name)
-    camera, no_lens = (kitti_root / "camera.yaml").read_text(), "model: opencv\ndistortion: [0, 0, 0, 0]"
+    camera, no_lens = (
+        (kitti_root / "camera.yaml").read_text(),
+        "model: opencv\ndistortion: [0, 0, 0, 0]",
+    )
     (folder / "camera.yaml").write_text(camera.replace("model: pinhole", no_lens))
     return folder
 
 
-def request_of(source: Path | str, weights: Path, settings: Sequence[str], output: Path, **options: Any) -> LiveRequest:
-    return LiveRequest(dataset=str(source), output=output, weights=str(weights), overrides=list(settings), **options)
+def request_of(
+    source: Path | str, weights: Path, settings: Sequence[str], output: Path, **options: Any
+) -> LiveRequest:
+    return LiveRequest(
+        dataset=str(source),
+        output=output,
+        weights=str(weights),
+        overrides=list(settings),
+        **options,
+    )
 
 
 def filled(
-    street: Path, tmp_path: Path, frames: int = FRAMES, broken: dict[int, bytes] | None = None, vanishes: bool = True
+    street: Path,
+    tmp_path: Path,
+    frames: int = FRAMES,
+    broken: dict[int, bytes] | None = None,
+    vanishes: bool = True,
 ) -> tuple[Path, list[dict[str, Any]]]:
     """A folder beside its camera file, and the list of messages that it is filled by.
 
@@ -59,7 +81,12 @@ def filled(
     target, messages, broken = tmp_path / "images", [], broken or {}
     target.mkdir()
     shutil.copy(street / "camera.yaml", tmp_path)
-    contents = dict(enumerate(path.read_bytes() for path in sorted((street / "images").iterdir())[:frames])) | broken
+    contents = (
+        dict(
+            enumerate(path.read_bytes() for path in sorted((street / "images").iterdir())[:frames])
+        )
+        | broken
+    )
 
     def run() -> None:
         answered = 0
@@ -76,12 +103,19 @@ def filled(
     return target, messages
 
 
-def test_a_folder_being_filled_gives_the_bytes_of_a_run(street: Path, tiny_weights: Path, tmp_path: Path) -> None:
+def test_a_folder_being_filled_gives_the_bytes_of_a_run(
+    street: Path, tiny_weights: Path, tmp_path: Path
+) -> None:
     target, messages = filled(street, tmp_path)
     request = request_of(target, tiny_weights, SETTINGS, tmp_path / "live", wait=600)
     folder = run_live(request, messages.append)
     offline = run_slam(street, weights=tiny_weights, overrides=SETTINGS, output=tmp_path / "run")
-    for name in ("trajectory_optimised.kitti.txt", "trajectory_odometry.tum.txt", "graph.g2o", "loops.json"):
+    for name in (
+        "trajectory_optimised.kitti.txt",
+        "trajectory_odometry.tum.txt",
+        "graph.g2o",
+        "loops.json",
+    ):
         assert (folder.path / name).read_bytes() == (offline.path / name).read_bytes()
     *poses, last = messages
     assert [message["frame"] for message in poses] == list(range(FRAMES))
@@ -91,14 +125,21 @@ def test_a_folder_being_filled_gives_the_bytes_of_a_run(street: Path, tiny_weigh
     assert [message["state"] == "tracking" for message in poses] == has_scale == sorted(has_scale)
     assert all(message["state"] == "starting" or message["scale"] > 0 for message in poses)
     corrected = np.array(last["T_world_camera"])
-    np.testing.assert_allclose(corrected, np.loadtxt(folder.path / "trajectory_optimised.kitti.txt"), atol=1e-6)
+    np.testing.assert_allclose(
+        corrected, np.loadtxt(folder.path / "trajectory_optimised.kitti.txt"), atol=1e-6
+    )
     assert last["dropped"] == 0
     assert folder.metrics().tree()["status"] == "ok"
 
 
 @pytest.mark.parametrize(("mode", "unit"), [("auto", None), ("none", "the networks' own unit")])
 def test_without_a_road_there_are_no_metres_and_no_camera_heights(
-    street: Path, tiny_weights: Path, tmp_path: Path, mode: str, unit: str | None, monkeypatch: pytest.MonkeyPatch
+    street: Path,
+    tiny_weights: Path,
+    tmp_path: Path,
+    mode: str,
+    unit: str | None,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("slam.frontend.road._ROAD_ROWS", (0.0, 0.001))  # at the horizon
     monkeypatch.setattr("slam.frontend.road._MIN_POINTS", 10**6)  # of the homography
@@ -127,10 +168,18 @@ def test_broken_images_are_left_out_and_a_folder_that_vanishes_leaves_a_whole_ru
     *poses, last = messages
     used = [0.1 * number for number in range(FRAMES) if number not in (5, 8)]
     assert [message["stamp"] for message in poses] == pytest.approx(used) == last["stamps"]
-    assert last["ended"].startswith("the source died") and "cannot be read any more" in last["ended"]
-    assert folder.metrics().tree()["status"] == "ok" and folder.metrics().tree()["sequence"]["frames"] == len(used)
+    assert (
+        last["ended"].startswith("the source died") and "cannot be read any more" in last["ended"]
+    )
+    assert folder.metrics().tree()["status"] == "ok" and folder.metrics().tree()["sequence"][
+        "frames"
+    ] == len(used)
     said = caplog.text
-    assert "000005.png" in said and "000008.png is 30 x 20, not" in said and said.count("it is left out") == 2
+    assert (
+        "000005.png" in said
+        and "000008.png is 30 x 20, not" in said
+        and said.count("it is left out") == 2
+    )
 
 
 def test_images_that_are_there_are_dropped_and_counted_unless_every_one_is_wanted(
@@ -140,7 +189,10 @@ def test_images_that_are_there_are_dropped_and_counted_unless_every_one_is_wante
     request = request_of(street / "images", tiny_weights, SETTINGS, tmp_path / "live", wait=0.5)
     try:  # while the first one is measured, most others come: how many frames are left depends on the machine
         run_live(request, messages.append)
-        assert messages[-1]["dropped"] > 0 and len(messages[-1]["stamps"]) + messages[-1]["dropped"] == FRAMES
+        assert (
+            messages[-1]["dropped"] > 0
+            and len(messages[-1]["stamps"]) + messages[-1]["dropped"] == FRAMES
+        )
     except SlamError as error:
         assert re.search(r"images were dropped, .* \(--every-frame drops none\)", str(error))
     assert re.search("images (were )?dropped", caplog.text)
@@ -151,7 +203,10 @@ def test_images_that_are_there_are_dropped_and_counted_unless_every_one_is_wante
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (("scale.mode=camera-height",), "scale mode camera-height needs a known height; images has none"),
+        (
+            ("scale.mode=camera-height",),
+            "scale mode camera-height needs a known height; images has none",
+        ),
         (("lidar.factors=true",), r"lidar\.factors=true needs LiDAR scans of neighbouring frames"),
     ],
 )
@@ -161,7 +216,9 @@ def test_what_the_settings_need_is_asked_before_the_first_frame(
     """A camera by its field of view alone has no height; frames that come have no scans and no numbers."""
     settings = (*SETTINGS, *settings)
     images, messages = str(street / "images"), []
-    request = request_of(images, tiny_weights, settings, tmp_path / "live", camera=Path("fov=70"), wait=0.5)
+    request = request_of(
+        images, tiny_weights, settings, tmp_path / "live", camera=Path("fov=70"), wait=0.5
+    )
     with pytest.raises(SlamError, match=words):
         run_live(request, messages.append)
     assert messages == [] and not (tmp_path / "live").exists()
@@ -184,7 +241,9 @@ def test_a_drive_that_fails_leaves_the_poses_that_it_had(
         run_live(request, listen)
     metrics = json.loads((tmp_path / "live" / "metrics.json").read_text())
     assert metrics["status"] == "failed" and metrics["reason"]
-    left = np.loadtxt(tmp_path / "live" / "trajectory_odometry.kitti.txt")  # said poses were corrected since
+    left = np.loadtxt(
+        tmp_path / "live" / "trajectory_odometry.kitti.txt"
+    )  # said poses were corrected since
     np.testing.assert_allclose(left[0], messages[0]["T_world_camera"])
     assert (np.linalg.norm(np.diff(left[:, 3::4], axis=0), axis=1) > 0).all() == (frames == 9)
     stamps = np.loadtxt(tmp_path / "live" / "trajectory_odometry.tum.txt")[:, 0]
@@ -233,7 +292,9 @@ def test_with_every_frame_a_source_waits_until_its_image_was_taken() -> None:
     for frame in sequence.frames():
         taken.append(int(frame.image[0, 0, 0]))
         time.sleep(0.001)
-    assert taken == list(range(20)) and sequence.dropped == 0 and sequence.ended == "the source ended"
+    assert (
+        taken == list(range(20)) and sequence.dropped == 0 and sequence.ended == "the source ended"
+    )
 
 
 def test_a_source_that_stalls_and_one_that_dies_say_so() -> None:
@@ -266,7 +327,9 @@ def served(video: Path) -> Iterator[str]:
         def log_message(self, *_: object) -> None:
             pass
 
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(video.parent))) as server:
+    with ThreadingHTTPServer(
+        ("127.0.0.1", 0), partial(Quiet, directory=str(video.parent))
+    ) as server:
         Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_port}/{video.name}"
         server.shutdown()
@@ -335,7 +398,13 @@ def test_the_viewer_is_shown_the_drive(
     run_live(request, messages.append)
     content = shown.read_bytes()
     assert content[:3] == b"RRF"
-    for place in (b"/world/path", b"/world/camera", b"/world/camera/image", b"/depth", b"/world/map/"):
+    for place in (
+        b"/world/path",
+        b"/world/camera",
+        b"/world/camera/image",
+        b"/depth",
+        b"/world/map/",
+    ):
         assert place in content, place
 
 
@@ -347,7 +416,9 @@ def test_a_video_plays_at_its_own_speed(video: Path) -> None:
     assert (source.width, source.height) == (32, 24)
 
 
-def test_a_folder_is_read_in_natural_order(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_folder_is_read_in_natural_order(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """Numbers without zeros in front; hidden files are no images, and one that comes too late is named."""
 
     def take(number: int) -> None:
@@ -360,7 +431,10 @@ def test_a_folder_is_read_in_natural_order(tmp_path: Path, caplog: pytest.LogCap
     for number in (10, 7, 9):
         take(number)
     assert [next(images), next(images)] == [9, 10]
-    assert "frame_7.png came after frame_8.png, before which its name belongs; it is left out" in caplog.text
+    assert (
+        "frame_7.png came after frame_8.png, before which its name belongs; it is left out"
+        in caplog.text
+    )
 
 
 def test_a_broken_first_image_is_left_out(street: Path, tmp_path: Path) -> None:
@@ -385,17 +459,38 @@ def test_sources_that_are_not_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "number", [signal.SIGINT, *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGTERM, signal.SIGHUP))]
+    "number",
+    [
+        signal.SIGINT,
+        *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGTERM, signal.SIGHUP)),
+    ],
 )
-def test_a_signal_leaves_a_whole_run(street: Path, tiny_weights: Path, tmp_path: Path, number: signal.Signals) -> None:
+def test_a_signal_leaves_a_whole_run(
+    street: Path, tiny_weights: Path, tmp_path: Path, number: signal.Signals
+) -> None:
     output = tmp_path / "run"
     target, messages = filled(street, tmp_path, vanishes=False)
-    command = [sys.executable, "-m", "slam", "live", "--dataset", str(target), "--output", str(output), "--wait", "600"]
+    command = [
+        sys.executable,
+        "-m",
+        "slam",
+        "live",
+        "--dataset",
+        str(target),
+        "--output",
+        str(output),
+        "--wait",
+        "600",
+    ]
     command += ["--camera", str(street / "camera.yaml")]
     command += ["--weights", str(tiny_weights), *(word for s in SETTINGS for word in ("--set", s))]
-    heeded = partial(signal.signal, number, signal.SIG_DFL)  # what a shell runs in the background ignores ctrl-C
+    heeded = partial(
+        signal.signal, number, signal.SIG_DFL
+    )  # what a shell runs in the background ignores ctrl-C
     pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, preexec_fn=heeded) as process:
+    with subprocess.Popen(
+        command, stdout=pipe, stderr=pipe, text=True, preexec_fn=heeded
+    ) as process:
         assert process.stdout is not None
         for _ in range(FRAMES):
             messages.append(json.loads(process.stdout.readline()))

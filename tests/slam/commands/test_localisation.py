@@ -51,7 +51,11 @@ def places() -> Places:
     for k in frames:
         rendered = sequence.street.render(k)
         depth = np.where(rendered.depth > 0, rendered.depth, np.nan).astype(np.float32)
-        views.append(extractor.view(Frame(k, 0.1 * k, rendered.image), depth, sequence.camera_height_m).scaled(UNIT))
+        views.append(
+            extractor.view(
+                Frame(k, 0.1 * k, rendered.image), depth, sequence.camera_height_m
+            ).scaled(UNIT)
+        )
     T_world_camera = reference()[list(frames)].copy()
     T_world_camera[:, :3, 3] *= UNIT
     return Places(sequence.intrinsics, tuple(views), T_world_camera)
@@ -95,20 +99,28 @@ def test_images_of_the_street_are_localised_where_they_were_taken(hazards: tuple
         T_error = invert(reference()[k]) @ result.T_world_camera
         away = np.linalg.norm(result.T_world_camera[:3, 3] / UNIT - reference()[k, :3, 3])
         assert away < 0.5 and rotation_angle(T_error[:3, :3]) < np.deg2rad(1.0)
-        assert result.nearest_frame is not None and abs(result.nearest_frame - k) <= 2 and result.inliers >= 20
+        assert (
+            result.nearest_frame is not None
+            and abs(result.nearest_frame - k) <= 2
+            and result.inliers >= 20
+        )
     assert found >= 3
 
 
 def test_wrong_learned_depth_is_replaced_by_what_neighbouring_places_measure() -> None:
     rng = np.random.default_rng(0)
     views = tuple(
-        replace(view, points=(view.points * rng.lognormal(0.0, 0.5, (len(view), 1))).astype(np.float32))
+        replace(
+            view, points=(view.points * rng.lognormal(0.0, 0.5, (len(view), 1))).astype(np.float32)
+        )
         for view in places().views
     )
     localiser = Localiser(replace(places(), views=views))
     for k in (10, 40):
         found = localiser.locate(f"{k}", street(630).frame(k).image).T_world_camera
-        assert found is not None and np.linalg.norm(found[:3, 3] / UNIT - reference()[k, :3, 3]) < 0.5
+        assert (
+            found is not None and np.linalg.norm(found[:3, 3] / UNIT - reference()[k, :3, 3]) < 0.5
+        )
 
 
 @pytest.mark.slow
@@ -119,7 +131,9 @@ def test_another_size_of_the_same_camera_is_found_too() -> None:
     own = Localiser(places(), places().intrinsics.resized(624, 192)).locate("own", twice)
     assert own.T_world_camera is not None
     assert np.linalg.norm(own.T_world_camera[:3, 3] / UNIT - reference()[31, :3, 3]) < 0.5
-    with pytest.raises(SequenceError, match="the image is 300x192, its camera 312x96: give its --camera"):
+    with pytest.raises(
+        SequenceError, match="the image is 300x192, its camera 312x96: give its --camera"
+    ):
         Localiser(places()).locate("cut", twice[:, :300])
 
 
@@ -127,23 +141,35 @@ def bent(image: Image, camera: CameraFile) -> Image:
     """An image of a pinhole as a lens of the same K takes it."""
     K = Intrinsics.of(camera.pinhole).K
     pixels = street(630).intrinsics.pixel_grid().reshape(-1, 1, 2)
-    seen = cv2.undistortPoints(pixels, K, np.array(camera.distortion), P=K).reshape(*image.shape[:2], 2)
+    seen = cv2.undistortPoints(pixels, K, np.array(camera.distortion), P=K).reshape(
+        *image.shape[:2], 2
+    )
     return np.asarray(cv2.remap(image, seen.astype(np.float32), None, cv2.INTER_LINEAR), np.uint8)
 
 
 @pytest.mark.parametrize(
-    ("where", "given"), [pytest.param("images", "images/25.png", marks=pytest.mark.slow), (".", "images"), (None, "")]
+    ("where", "given"),
+    [pytest.param("images", "images/25.png", marks=pytest.mark.slow), (".", "images"), (None, "")],
 )
-def test_images_of_a_lens_need_its_camera_file(run: RunFolder, tmp_path: Path, where: str | None, given: str) -> None:
+def test_images_of_a_lens_need_its_camera_file(
+    run: RunFolder, tmp_path: Path, where: str | None, given: str
+) -> None:
     """It is looked for where ``run`` looks."""
-    run.write(PLACES, replace(places(), intrinsics=replace(places().intrinsics, undistorted=True)).write)
+    run.write(
+        PLACES, replace(places(), intrinsics=replace(places().intrinsics, undistorted=True)).write
+    )
     pinhole = places().intrinsics
     keys = {name: getattr(pinhole, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
-    lens = CameraFile.model_validate(keys | {"fps": 10, "model": "opencv", "distortion": (-0.2, 0.0, 0.0, 0.0)})
+    lens = CameraFile.model_validate(
+        keys | {"fps": 10, "model": "opencv", "distortion": (-0.2, 0.0, 0.0, 0.0)}
+    )
     (tmp_path / "album" / "images").mkdir(parents=True)
     save(tmp_path / "album" / "images" / "25.png", bent(street(630).frame(25).image, lens))
     if where is None:
-        with pytest.raises(SequenceError, match=r"undistorted its images, and .*album has no camera\.yaml: give its"):
+        with pytest.raises(
+            SequenceError,
+            match=r"undistorted its images, and .*album has no camera\.yaml: give its",
+        ):
             localise(tmp_path / "album", run)
         return
     (tmp_path / "album" / where / "camera.yaml").write_text(lens.model_dump_json(exclude_none=True))
@@ -155,12 +181,19 @@ def test_images_of_a_lens_need_its_camera_file(run: RunFolder, tmp_path: Path, w
 def test_a_camera_of_another_size_is_refused_image_by_image(run: RunFolder, album: Path) -> None:
     camera = album / "camera.yaml"
     lens = "model: opencv, distortion: [-0.1, 0, 0, 0]"
-    camera.write_text(f"{{width: 156, height: 48, fx: 90, fy: 90, cx: 77.5, cy: 23.5, fps: 10, {lens}}}")
+    camera.write_text(
+        f"{{width: 156, height: 48, fx: 90, fy: 90, cx: 77.5, cy: 23.5, fps: 10, {lens}}}"
+    )
     for found in localise(album, run, camera)[:4]:
-        assert found.T_world_camera is None and "the image is 312x96, its camera 156x48: give" in found.reason
+        assert (
+            found.T_world_camera is None
+            and "the image is 312x96, its camera 156x48: give" in found.reason
+        )
 
 
-@pytest.mark.parametrize("what", ["another street", "black", pytest.param("noise", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "what", ["another street", "black", pytest.param("noise", marks=pytest.mark.slow)]
+)
 def test_images_of_other_places_are_refused(what: str) -> None:
     images = {
         "another street": [street(seed).frame(k).image for seed, k in ((631, 5), (632, 40))],
@@ -173,7 +206,9 @@ def test_images_of_other_places_are_refused(what: str) -> None:
         assert result.T_world_camera is None and result.nearest_frame is None and result.reason
 
 
-def test_a_folder_of_images_is_localised_in_a_run(run: RunFolder, album: Path, tmp_path: Path) -> None:
+def test_a_folder_of_images_is_localised_in_a_run(
+    run: RunFolder, album: Path, tmp_path: Path
+) -> None:
     found = localise(album, run)
     assert [each.image for each in found] == ["10.png", "25.png", "40.png", "50.png", "60.png"]
     assert [each.T_world_camera is not None for each in found] == [True, True, True, False, False]
@@ -194,7 +229,9 @@ def test_a_folder_of_images_is_localised_in_a_run(run: RunFolder, album: Path, t
     numbered = [replace(each, number=int(Path(each.image).stem)) for each in found]
     write_localisations(tmp_path / "found.kitti", numbered)
     write_kitti(tmp_path / "truth.txt", Trajectory(np.arange(float(FRAMES)), reference()))
-    pair = associate(read_trajectory(tmp_path / "found.kitti"), read_trajectory(tmp_path / "truth.txt"))
+    pair = associate(
+        read_trajectory(tmp_path / "found.kitti"), read_trajectory(tmp_path / "truth.txt")
+    )
     assert [len(each) for each in pair] == [3, 3]
     np.testing.assert_allclose(pair[0].positions / UNIT, pair[1].positions, atol=0.5)
 

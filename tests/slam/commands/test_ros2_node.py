@@ -29,7 +29,15 @@ NODE = Path(__file__).parents[3] / "tools" / "ros2" / "slam_node.py"
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 FRAMES, FIRST_S = 12, 1_700_000_000
 MESSAGES = {
-    "geometry_msgs": ("Point", "Pose", "PoseStamped", "Quaternion", "Transform", "TransformStamped", "Vector3"),
+    "geometry_msgs": (
+        "Point",
+        "Pose",
+        "PoseStamped",
+        "Quaternion",
+        "Transform",
+        "TransformStamped",
+        "Vector3",
+    ),
     "nav_msgs": ("MapMetaData", "OccupancyGrid", "Path"),
     "sensor_msgs": ("CameraInfo", "Image", "PointCloud2", "PointField"),
     "std_msgs": ("Header",),
@@ -64,7 +72,9 @@ class RecordedNode:
     def create_publisher(self, kind: type, topic: str, qos: Any) -> SimpleNamespace:
         return SimpleNamespace(publish=self._keeper(kind, topic))
 
-    def create_subscription(self, kind: type, topic: str, callback: Callable[[Any], None], qos: Any) -> None:
+    def create_subscription(
+        self, kind: type, topic: str, callback: Callable[[Any], None], qos: Any
+    ) -> None:
         self.callbacks[topic] = callback
 
     def create_service(self, kind: type, name: str, callback: Callable[[Any, Any], Any]) -> None:
@@ -139,10 +149,16 @@ def node_module(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     module("rclpy.node", Node=RecordedNode)
     module("rclpy.qos", **QOS)
     module("rclpy.time", Time=RosTime)
-    listener = {"Buffer": Buffer, "TransformListener": lambda *_: None, "TransformException": Unknown}
+    listener = {
+        "Buffer": Buffer,
+        "TransformListener": lambda *_: None,
+        "TransformException": Unknown,
+    }
     module("tf2_ros", TransformBroadcaster=Broadcaster, **listener)
     module("std_srvs")
-    module("std_srvs.srv", Trigger=SimpleNamespace(Request=SimpleNamespace, Response=SimpleNamespace))
+    module(
+        "std_srvs.srv", Trigger=SimpleNamespace(Request=SimpleNamespace, Response=SimpleNamespace)
+    )
     monkeypatch.syspath_prepend(str(NODE.parent))
     spec = importlib.util.spec_from_file_location("slam_node", NODE)
     assert spec is not None and spec.loader is not None
@@ -152,7 +168,9 @@ def node_module(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def header(number: int) -> Any:
-    stamp = STORE.types["builtin_interfaces/msg/Time"](sec=FIRST_S + number // 10, nanosec=number % 10 * 10**8)
+    stamp = STORE.types["builtin_interfaces/msg/Time"](
+        sec=FIRST_S + number // 10, nanosec=number % 10 * 10**8
+    )
     return STORE.types["std_msgs/msg/Header"](stamp=stamp, frame_id="front_optical")
 
 
@@ -166,17 +184,39 @@ def info_message(K: np.ndarray, width: int, height: int) -> Any:
     made = STORE.types["sensor_msgs/msg/CameraInfo"]
     region = STORE.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
     P = np.column_stack([K, np.zeros(3)]).ravel()
-    return made(header(0), height, width, "plumb_bob", np.zeros(5), K.ravel(), np.eye(3).ravel(), P, 0, 0, region)
+    return made(
+        header(0),
+        height,
+        width,
+        "plumb_bob",
+        np.zeros(5),
+        K.ravel(),
+        np.eye(3).ravel(),
+        P,
+        0,
+        0,
+        region,
+    )
 
 
 def test_the_node_publishes_what_slam_finds(
-    node_module: ModuleType, kitti_root: Path, tiny_weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    node_module: ModuleType,
+    kitti_root: Path,
+    tiny_weights: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     drive = open_sequence(kitti_root)
     intrinsics, images = drive.intrinsics, [drive.frame(k).image for k in range(FRAMES)]
     written = tmp_path / "walk.txt"
-    asked = {"weights": str(tiny_weights), "camera_height_m": 1.65, "settings": "loops.enabled=false"}
-    monkeypatch.setattr(RecordedNode, "parameters", asked | {"trajectory": str(written), "path_every": 5})
+    asked = {
+        "weights": str(tiny_weights),
+        "camera_height_m": 1.65,
+        "settings": "loops.enabled=false",
+    }
+    monkeypatch.setattr(
+        RecordedNode, "parameters", asked | {"trajectory": str(written), "path_every": 5}
+    )
     node = node_module.SlamNode()
     add, begin = node.callbacks["image"], node.callbacks["camera_info"]
     add(image_message(images[0], 0))
@@ -186,7 +226,11 @@ def test_the_node_publishes_what_slam_finds(
         add(image_message(image, number))
     add(image_message(images[-1][:-1], FRAMES))  # of another size
     add(image_message(images[-1], FRAMES - 1))  # of the same time
-    assert len(node.logged) == 3 and "image must be" in node.logged[1] and "stamps must increase" in node.logged[2]
+    assert (
+        len(node.logged) == 3
+        and "image must be" in node.logged[1]
+        and "stamps must increase" in node.logged[2]
+    )
     node.finish()
 
     config = load_config(None, ["loops.enabled=false"])
@@ -199,7 +243,9 @@ def test_the_node_publishes_what_slam_finds(
         solved = slam.trajectory()
     poses, paths, transforms = (node.published[topic] for topic in ("pose", "path", "tf"))
     assert [len(path.poses) for path in paths] == [5, 10]
-    for number, (pose, in_odom, in_map) in enumerate(zip(poses, transforms[::2], transforms[1::2], strict=True)):
+    for number, (pose, in_odom, in_map) in enumerate(
+        zip(poses, transforms[::2], transforms[1::2], strict=True)
+    ):
         x, y, z = expected[number].positions[-1]
         at = pose.pose.position
         np.testing.assert_allclose([at.x, at.y, at.z], [z, -x, -y], atol=1e-12)
@@ -207,7 +253,10 @@ def test_the_node_publishes_what_slam_finds(
         assert (in_odom.header.frame_id, in_odom.child_frame_id) == ("odom", "front_optical")
         T_map_camera = matrix(node_module, in_map) @ matrix(node_module, in_odom)
         np.testing.assert_allclose(T_map_camera[:3, 3], [at.x, at.y, at.z], atol=1e-12)
-        assert pose.header == in_map.header and pose.header.stamp == in_odom.header.stamp == header(number).stamp
+        assert (
+            pose.header == in_map.header
+            and pose.header.stamp == in_odom.header.stamp == header(number).stamp
+        )
     first = poses[0].pose.orientation  # z of the camera ahead, along x of the map
     np.testing.assert_allclose([first.x, first.y, first.z, first.w], [-0.5, 0.5, -0.5, 0.5])
     last = paths[-1].poses[-1].pose.position
@@ -245,18 +294,28 @@ def test_loops_move_the_map_and_not_the_odometry(
         node.callbacks["image"](image_message(drive.frame(number).image, number))
     odom = np.array([matrix(node_module, each) for each in node.published["tf"][::2]])
     in_map = np.array([matrix(node_module, each) for each in node.published["tf"][1::2]])
-    np.testing.assert_allclose(in_map[0] @ odom[0], np.eye(4), atol=1e-9)  # the map begins at the robot
+    np.testing.assert_allclose(
+        in_map[0] @ odom[0], np.eye(4), atol=1e-9
+    )  # the map begins at the robot
     steps = np.linalg.norm(np.diff(odom[:, :3, 3], axis=0), axis=1)
     moved = np.linalg.norm(np.diff((in_map @ odom)[:, :3, 3], axis=0), axis=1)
     assert steps.max() < 1.5 < moved.max(), "the first unit moves the map, and odom goes on"
-    clouds, points, grids = (node.published[topic] for topic in ("keyframe_points", "map_points", "map"))
+    clouds, points, grids = (
+        node.published[topic] for topic in ("keyframe_points", "map_points", "map")
+    )
     assert clouds and {each.header.frame_id for each in clouds} == {"front_optical"}
-    assert len(points) == 2 and points[-1].header.frame_id == "map", "by the service and after 12 frames"
-    assert [each.info.width * each.info.height for each in grids] == [len(each.data) for each in grids]
+    assert len(points) == 2 and points[-1].header.frame_id == "map", (
+        "by the service and after 12 frames"
+    )
+    assert [each.info.width * each.info.height for each in grids] == [
+        len(each.data) for each in grids
+    ]
     monkeypatch.setattr(RecordedNode, "parameters", asked | {"publish_tf": "map_to_odom"})
     monkeypatch.setitem(Buffer.known, ("odom", "base_link"), placed)
     of_robot = node_module.SlamNode()
-    of_robot.callbacks["camera_info"](info_message(intrinsics.K, intrinsics.width, intrinsics.height))
+    of_robot.callbacks["camera_info"](
+        info_message(intrinsics.K, intrinsics.width, intrinsics.height)
+    )
     of_robot.callbacks["image"](image_message(drive.frame(0).image, 0))
     (only,) = of_robot.published["tf"]
     assert only.child_frame_id == "odom"
@@ -267,8 +326,12 @@ def test_an_occupancy_grid_follows_its_keyframes(node_module: ModuleType) -> Non
     """A wall 6 m ahead of two keyframes; the second one is moved by a loop."""
     from live_map import LiveMap
 
-    side, ahead = (each.ravel() for each in np.meshgrid(np.arange(-3, 3, 0.1), np.arange(1, 6, 0.1)))
-    across, up = (each.ravel() for each in np.meshgrid(np.arange(-3, 3, 0.1), np.arange(-1, 1, 0.1)))
+    side, ahead = (
+        each.ravel() for each in np.meshgrid(np.arange(-3, 3, 0.1), np.arange(1, 6, 0.1))
+    )
+    across, up = (
+        each.ravel() for each in np.meshgrid(np.arange(-3, 3, 0.1), np.arange(-1, 1, 0.1))
+    )
     road = np.column_stack([side, np.full(len(side), 1.65), ahead])
     cloud = np.concatenate([road, np.column_stack([across, up, np.full(len(up), 6.2)])])
     T_map_camera = np.array([node_module.T_MAP_WORLD] * 2)
@@ -280,17 +343,27 @@ def test_an_occupancy_grid_follows_its_keyframes(node_module: ModuleType) -> Non
         cells, grid = live_map.grid(T_map_camera, 1.65, 1.0)
         row = cells[cells.shape[0] // 2]
         walls = {float(grid.corner[0] + 0.5 * k): int(row[k]) for k in np.flatnonzero(row > 0)}
-        assert walls == ({6.0: 100, 27.0: 100} if moved else {6.0: 50, 7.0: 100}), "the second sees road at 6 m"
+        assert walls == ({6.0: 100, 27.0: 100} if moved else {6.0: 50, 7.0: 100}), (
+            "the second sees road at 6 m"
+        )
         assert (row == 0).sum() >= 8 and len(live_map.points(T_map_camera)) > 100
 
 
-def test_the_launch_file_gives_every_parameter(monkeypatch: pytest.MonkeyPatch, node_module: ModuleType) -> None:
-    for name, kind in (("launch", "LaunchDescription"), ("launch.substitutions", "LaunchConfiguration")):
+def test_the_launch_file_gives_every_parameter(
+    monkeypatch: pytest.MonkeyPatch, node_module: ModuleType
+) -> None:
+    for name, kind in (
+        ("launch", "LaunchDescription"),
+        ("launch.substitutions", "LaunchConfiguration"),
+    ):
         made = ModuleType(name)
         setattr(made, kind, lambda content: content)
         monkeypatch.setitem(sys.modules, name, made)
     actions = ModuleType("launch.actions")
-    vars(actions).update(DeclareLaunchArgument=lambda name, default_value: name, ExecuteProcess=lambda cmd, output: cmd)
+    vars(actions).update(
+        DeclareLaunchArgument=lambda name, default_value: name,
+        ExecuteProcess=lambda cmd, output: cmd,
+    )
     monkeypatch.setitem(sys.modules, "launch.actions", actions)
     spec = importlib.util.spec_from_file_location("slam_launch", NODE.with_name("slam.launch.py"))
     assert spec is not None and spec.loader is not None
@@ -307,7 +380,9 @@ def test_a_distorted_camera_and_one_that_is_rectified(
 ) -> None:
     drive = open_sequence(kitti_root)
     intrinsics, image = drive.intrinsics, drive.frame(0).image
-    monkeypatch.setattr(RecordedNode, "parameters", {"weights": str(tiny_weights), "publish_tf": "none"})
+    monkeypatch.setattr(
+        RecordedNode, "parameters", {"weights": str(tiny_weights), "publish_tf": "none"}
+    )
     seen, add_frame = [], Slam.add_frame
 
     def watched(slam: Slam, image: np.ndarray, stamp: float) -> None:

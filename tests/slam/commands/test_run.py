@@ -37,10 +37,19 @@ NO_REPORT = "output.report=false"
 
 
 @pytest.fixture(scope="module")
-def run(kitti_root: Path, tiny_weights: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+def run(
+    kitti_root: Path, tiny_weights: Path, tmp_path_factory: pytest.TempPathFactory
+) -> RunFolder:
     """One whole run with everything on. Not to be changed."""
     output = tmp_path_factory.mktemp("runs") / "run"
-    return run_slam(kitti_root, "sim", weights=tiny_weights, output=output, seed=3, command="erfsfm-slam run ...")
+    return run_slam(
+        kitti_root,
+        "sim",
+        weights=tiny_weights,
+        output=output,
+        seed=3,
+        command="erfsfm-slam run ...",
+    )
 
 
 @pytest.fixture
@@ -52,7 +61,13 @@ def quick(kitti_root: Path, tiny_weights: Path, tmp_path: Path) -> dict[str, Any
         f"output.root={tmp_path / 'results'}",
         NO_REPORT,
     ]
-    return {"dataset": kitti_root, "sequence": "sim", "weights": tiny_weights, "overrides": overrides, "frames": "0:8"}
+    return {
+        "dataset": kitti_root,
+        "sequence": "sim",
+        "weights": tiny_weights,
+        "overrides": overrides,
+        "frames": "0:8",
+    }
 
 
 @pytest.fixture
@@ -65,11 +80,18 @@ def test_every_file_and_every_number(run: RunFolder, check_run: CheckRun) -> Non
     metrics = check_run(run.path)
     provenance = metrics["provenance"]
     assert (provenance["seed"], provenance["device"]) == (3, "cpu")
-    assert provenance["command"] == "erfsfm-slam run ..." and provenance["weights_licence"] == "none, untrained"
+    assert (
+        provenance["command"] == "erfsfm-slam run ..."
+        and provenance["weights_licence"] == "none, untrained"
+    )
     assert re.fullmatch("[0-9a-f]{64}", provenance["weights_sha256"])
     assert provenance["trained_on"] == ["simulated/17"] and provenance["leak"] is False
     sequence = metrics["sequence"]
-    assert (sequence["name"], sequence["frames"], sequence["fps"]) == ("sim", 14, pytest.approx(10.0))
+    assert (sequence["name"], sequence["frames"], sequence["fps"]) == (
+        "sim",
+        14,
+        pytest.approx(10.0),
+    )
     assert 9 < sequence["length_m"] < 18
     assert sum(metrics["timing"]["stages"].values()) <= metrics["timing"]["seconds_total"]
     assert metrics["trajectories"]["lidar"] is None
@@ -85,7 +107,10 @@ def test_the_report_and_the_log_describe_it(run: RunFolder) -> None:
     assert not re.search(r"(src|href)=['\"]https?:", report)
     assert "map is empty" in report, "an untrained network sees no world"
     assert "slam.graph.pose_graph: pose graph" in (run.path / "run.log").read_text()
-    assert all(not isinstance(handler, logging.FileHandler) for handler in logging.getLogger("slam").handlers)
+    assert all(
+        not isinstance(handler, logging.FileHandler)
+        for handler in logging.getLogger("slam").handlers
+    )
 
 
 def test_the_snippets_of_the_network_are_its_direct_poses(run: RunFolder) -> None:
@@ -114,7 +139,9 @@ def test_a_run_that_fails_says_why_and_leaves_nothing_of_the_one_before(
     whole = set(contents(run_slam(**reported, output=output).path))
     for image in sorted((root / "sequences" / "sim" / "image_2").glob("*.png"))[3:]:
         image.write_bytes(image.read_bytes()[:200])
-    with pytest.raises(SlamError, match=r"no 5 usable frames in a row among 14: .*000003\.png is truncated"):
+    with pytest.raises(
+        SlamError, match=r"no 5 usable frames in a row among 14: .*000003\.png is truncated"
+    ):
         run_slam(**reported | {"dataset": root, "frames": None}, output=output)
     metrics = json.loads((output / "metrics.json").read_text())
     assert metrics["status"] == "failed" and "000003.png is truncated" in metrics["reason"]
@@ -124,7 +151,10 @@ def test_a_run_that_fails_says_why_and_leaves_nothing_of_the_one_before(
     assert "the run failed" in (output / "run.log").read_text()
     assert yaml.safe_load((output / "config.yaml").read_text())["mapping"]["enabled"] is False
     assert not any(path.name.startswith("trajectory") for path in output.iterdir())
-    assert run_slam(**reported, output=output).metrics().status == "ok" and set(contents(output)) == whole
+    assert (
+        run_slam(**reported, output=output).metrics().status == "ok"
+        and set(contents(output)) == whole
+    )
 
 
 def test_an_unreadable_image_is_bridged_and_reported(
@@ -154,7 +184,9 @@ def test_unreadable_scans_are_left_out_and_reported(
     (scans / "000006.bin").write_bytes(b"12345")
     folder = run_slam(**reported | {"dataset": root, "frames": None})
     (gap,) = check_run(folder.path)["sequence"]["unreadable_scans"]
-    assert (gap["first"], gap["last"]) == (6, 6) and "000006.bin is no Velodyne scan" in gap["reason"]
+    assert (gap["first"], gap["last"]) == (6, 6) and "000006.bin is no Velodyne scan" in gap[
+        "reason"
+    ]
     for name in ("report.html", "run.log"):
         assert "000006.bin is no Velodyne scan" in (folder.path / name).read_text()
     for scan in scans.iterdir():
@@ -175,7 +207,11 @@ def test_unreadable_scans_are_left_out_and_reported(
     ],
 )
 def test_however_a_run_ends_its_folder_has_the_reason(
-    quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, reason: str
+    quick: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    error: BaseException,
+    reason: str,
 ) -> None:
     def stop(self: SlamPipeline, *_: object) -> None:
         raise error
@@ -188,14 +224,23 @@ def test_however_a_run_ends_its_folder_has_the_reason(
 
 
 def test_an_untrained_pose_network_with_two_sources_runs(
-    reported: dict[str, Any], tmp_path: Path, write_weights: Callable[..., Path], check_run: CheckRun
+    reported: dict[str, Any],
+    tmp_path: Path,
+    write_weights: Callable[..., Path],
+    check_run: CheckRun,
 ) -> None:
-    metrics = check_run(run_slam(**reported | {"weights": write_weights(tmp_path / "three", sources=2)}).path)
+    metrics = check_run(
+        run_slam(**reported | {"weights": write_weights(tmp_path / "three", sources=2)}).path
+    )
     assert metrics["trajectories"]["network"]["snippet5"]["count"] == 4
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 def call(*arguments: object) -> int:
@@ -211,21 +256,29 @@ def test_an_unknown_argument_is_named() -> None:
         run_slam(**{"sped": 3})  # type: ignore[misc]
 
 
-@pytest.mark.parametrize("option", [{"seed": -1}, {"frames": 8}, {"overrides": "a=b"}, {"progress": 5}])
-def test_an_argument_of_another_kind_is_named(quick: dict[str, Any], option: dict[str, Any], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "option", [{"seed": -1}, {"frames": 8}, {"overrides": "a=b"}, {"progress": 5}]
+)
+def test_an_argument_of_another_kind_is_named(
+    quick: dict[str, Any], option: dict[str, Any], tmp_path: Path
+) -> None:
     with pytest.raises(RunError, match=f"run_slam: {next(iter(option))}: "):
         run_slam(**quick | {"output": tmp_path / "run"} | option)
     assert not (tmp_path / "run").exists()
 
 
-def test_a_folder_of_another_program_is_refused_before_any_work(quick: dict[str, Any], tmp_path: Path) -> None:
+def test_a_folder_of_another_program_is_refused_before_any_work(
+    quick: dict[str, Any], tmp_path: Path
+) -> None:
     (tmp_path / "config.yaml").write_text("mine")
     with pytest.raises(RunError, match="not empty and holds no run"):
         run_slam(**quick | {"weights": tmp_path / "nowhere"}, output=tmp_path)
     assert contents(tmp_path) == {"config.yaml": b"mine"}
 
 
-def test_output_is_used_again_and_only_its_own_files_go(quick: dict[str, Any], tmp_path: Path) -> None:
+def test_output_is_used_again_and_only_its_own_files_go(
+    quick: dict[str, Any], tmp_path: Path
+) -> None:
     output = tmp_path / "mine"
     run_slam(**quick, output=output)
     (output / "map_mesh.ply").write_text("of an older run")
@@ -237,7 +290,9 @@ def test_output_is_used_again_and_only_its_own_files_go(quick: dict[str, Any], t
     assert not (tmp_path / "results").exists()
 
 
-def test_a_run_that_cannot_begin_leaves_an_earlier_one_as_it_is(quick: dict[str, Any], tmp_path: Path) -> None:
+def test_a_run_that_cannot_begin_leaves_an_earlier_one_as_it_is(
+    quick: dict[str, Any], tmp_path: Path
+) -> None:
     output = tmp_path / "run"
     run_slam(**quick, output=output)
     before = contents(output)
@@ -245,7 +300,9 @@ def test_a_run_that_cannot_begin_leaves_an_earlier_one_as_it_is(quick: dict[str,
     (tmp_path / "weights" / "model.yaml").write_text("{")
     shutil.copytree(quick["weights"], tmp_path / "infinite")
     tensors = load_file(tmp_path / "infinite" / "pose.safetensors")
-    next(value for value in tensors.values() if value.is_floating_point()).view(-1)[0] = float("nan")
+    next(value for value in tensors.values() if value.is_floating_point()).view(-1)[0] = float(
+        "nan"
+    )
     save_file(tensors, tmp_path / "infinite" / "pose.safetensors")
     for wish in (
         {"weights": tmp_path / "infinite"},
@@ -262,10 +319,19 @@ def test_a_run_that_cannot_begin_leaves_an_earlier_one_as_it_is(quick: dict[str,
 
 
 @pytest.mark.parametrize(
-    "stage", ["graph", "map", *(pytest.param(stage, marks=pytest.mark.slow) for stage in ("loops", "report"))]
+    "stage",
+    [
+        "graph",
+        "map",
+        *(pytest.param(stage, marks=pytest.mark.slow) for stage in ("loops", "report")),
+    ],
 )
 def test_a_stage_that_fails_costs_its_results(
-    stage: str, quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    stage: str,
+    quick: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     def failing(*_: object, **__: object) -> None:
         raise KeyError(0)
@@ -278,10 +344,16 @@ def test_a_stage_that_fails_costs_its_results(
     }
     monkeypatch.setattr(place[stage], failing)
     words = ["--dataset", quick["dataset"], "--weights", quick["weights"], "--frames", "0:8"]
-    assert call("run", *words, "--set", "visual_odometry.enabled=false", "--output", tmp_path / "run") == 0
+    assert (
+        call("run", *words, "--set", "visual_odometry.enabled=false", "--output", tmp_path / "run")
+        == 0
+    )
     assert "failed: unexpected KeyError: 0 (test_run.py:" in caplog.text
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())
-    assert metrics["status"] == "ok" and metrics["trajectories"]["optimised"]["align"]["7dof"]["ate_rmse_m"] > 0
+    assert (
+        metrics["status"] == "ok"
+        and metrics["trajectories"]["optimised"]["align"]["7dof"]["ate_rmse_m"] > 0
+    )
     lost = {
         "loops": [("loops", "accepted")],
         "graph": [("loops", "accepted"), ("graph", "nodes")],
@@ -296,7 +368,11 @@ def test_a_stage_that_fails_costs_its_results(
 @pytest.mark.usefixtures("as_in_the_foreground")
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_a_signal_during_the_pass_leaves_a_whole_run_of_what_was_seen(
-    quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, name: str
+    quick: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    name: str,
 ) -> None:
     def interrupted(self: FolderRecorder, observer: Observer) -> None:
         if observer.frames == 6:
@@ -307,7 +383,9 @@ def test_a_signal_during_the_pass_leaves_a_whole_run_of_what_was_seen(
     metrics = folder.metrics()
     assert (metrics.status, metrics.sequence.frames) == ("ok", 6)
     assert "the first 6 of 8 frames" in caplog.text
-    assert all(len(folder.trajectory(each) or ()) == 6 for each in ("network", "optimised", "reference"))
+    assert all(
+        len(folder.trajectory(each) or ()) == 6 for each in ("network", "optimised", "reference")
+    )
 
 
 def test_a_signal_before_the_first_snippet_ends_a_run(
@@ -351,14 +429,28 @@ run_slam(root, "sim", weights=weights, output=Path(output), frames="0:8", overri
 
 @pytest.mark.slow
 def test_a_run_that_was_killed_in_its_map_can_be_used_and_replaced(
-    quick: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+    quick: dict[str, Any],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     output = tmp_path / "run"
     arguments = [str(quick["dataset"]), str(quick["weights"]), str(output)]
-    assert subprocess.run([sys.executable, "-c", KILLED, *arguments], check=False).returncode == -signal.SIGKILL
+    assert (
+        subprocess.run([sys.executable, "-c", KILLED, *arguments], check=False).returncode
+        == -signal.SIGKILL
+    )
     assert RunFolder.open(output).metrics().tree()["status"] == "estimated"
     images = quick["dataset"] / "sequences" / "sim" / "image_2"
-    run = ("run", "--dataset", quick["dataset"], "--weights", quick["weights"], "--set", "mapping.enabled=false")
+    run = (
+        "run",
+        "--dataset",
+        quick["dataset"],
+        "--weights",
+        quick["weights"],
+        "--set",
+        "mapping.enabled=false",
+    )
     for numbers in ("estimated", "running", "absent"):
         if numbers == "running":
             (output / "metrics.json").write_text(
@@ -375,7 +467,9 @@ def test_a_run_that_was_killed_in_its_map_can_be_used_and_replaced(
         if numbers == "estimated":
             assert entry["trajectories"]["optimised"]["align"]["7dof"]["ate_rmse_m"] > 0
     assert call("localize", images / "000003.png", "--map", output) == 0
-    (output / "metrics.json").write_text('{"schema": 1, "status": "running", "provenance": {"weights_sha256": "00"}}')
+    (output / "metrics.json").write_text(
+        '{"schema": 1, "status": "running", "provenance": {"weights_sha256": "00"}}'
+    )
     assert call(*run, "--frames", "0:8", "--output", output) == 0
     assert RunFolder.open(output).metrics().tree()["status"] == "ok"
 

@@ -85,18 +85,25 @@ def test_our_exported_network_gives_the_run_of_our_weights(
         length = np.linalg.norm(positions(own, name)[-1])
         np.testing.assert_allclose(positions(other, name), positions(own, name), atol=2e-3 * length)
     provenance = check_run(other.path)["provenance"]
-    assert provenance["depth_source"] == f"onnx:{exported}" and len(provenance["depth_sha256"]) == 64
+    assert (
+        provenance["depth_source"] == f"onnx:{exported}" and len(provenance["depth_sha256"]) == 64
+    )
     assert provenance["depth_sha256"] != provenance["weights_sha256"]
     before = check_run(own.path)["provenance"]
     assert (before["depth_source"], before["depth_sha256"]) == ("network", before["weights_sha256"])
 
 
-def test_exact_depth_gives_a_run_of_the_right_scale_in_any_unit(world: Path, arrays: Path, tmp_path: Path) -> None:
+def test_exact_depth_gives_a_run_of_the_right_scale_in_any_unit(
+    world: Path, arrays: Path, tmp_path: Path
+) -> None:
     pictures = run(world, tmp_path / "png", f"png:{exact(world)}")
     metrics = pictures.metrics().tree()
     assert metrics["scale"]["value"] == pytest.approx(1.0, abs=0.06)
     aligned = metrics["trajectories"]["optimised"]["align"]
-    assert aligned["7dof"]["scale"] == pytest.approx(1.0, abs=0.06) and aligned["7dof"]["ate_rmse_m"] < 0.3
+    assert (
+        aligned["7dof"]["scale"] == pytest.approx(1.0, abs=0.06)
+        and aligned["7dof"]["ate_rmse_m"] < 0.3
+    )
     thirds = run(world, tmp_path / "npy", f"npy:{arrays}")
     assert thirds.metrics().tree()["scale"]["value"] == pytest.approx(1 / 3, rel=0.06)
     length = float(np.linalg.norm(positions(pictures)[-1]))
@@ -106,8 +113,12 @@ def test_exact_depth_gives_a_run_of_the_right_scale_in_any_unit(world: Path, arr
 
 
 @pytest.mark.slow
-def test_exact_depth_gives_a_map_and_a_report_that_names_it(world: Path, tmp_path: Path, check_run: CheckRun) -> None:
-    pictures = run(world, tmp_path / "png", f"png:{exact(world)}", *COARSE_MAP, "output.report=true")
+def test_exact_depth_gives_a_map_and_a_report_that_names_it(
+    world: Path, tmp_path: Path, check_run: CheckRun
+) -> None:
+    pictures = run(
+        world, tmp_path / "png", f"png:{exact(world)}", *COARSE_MAP, "output.report=true"
+    )
     assert check_run(pictures.path)["map"]["triangles"] > 0
     assert f"png:{exact(world)}" in (pictures.path / "report.html").read_text()
 
@@ -124,22 +135,39 @@ def test_a_range_of_frames_and_a_blank_one(
 
 def test_depth_of_distorted_images_is_undistorted_with_them(world: Path, tmp_path: Path) -> None:
     depth, camera = exact(world) / "000000.png", tmp_path / "camera.yaml"
-    lens: dict[str, Any] = {"width": 312, "height": 96, "fx": 180, "fy": 180, "cx": 155, "cy": 45, "fps": 10}
+    lens: dict[str, Any] = {
+        "width": 312,
+        "height": 96,
+        "fx": 180,
+        "fy": 180,
+        "cx": 155,
+        "cy": 45,
+        "fps": 10,
+    }
     camera.write_text(yaml.safe_dump(lens | {"model": "opencv", "distortion": [-0.2, 0.03, 0, 0]}))
     recording = open_sequence(world, "sim", camera)
     pinhole, lens = recording.intrinsics, recording.undistortion
     assert lens is not None
-    K, coefficients = np.array([[180, 0, 155], [0, 180, 45], [0, 0, 1.0]]), np.array([-0.2, 0.03, 0, 0])
-    maps = cv2.initUndistortRectifyMap(K, coefficients, np.eye(3), pinhole.K, (312, 96), cv2.CV_32FC1)
+    K, coefficients = (
+        np.array([[180, 0, 155], [0, 180, 45], [0, 0, 1.0]]),
+        np.array([-0.2, 0.03, 0, 0]),
+    )
+    maps = cv2.initUndistortRectifyMap(
+        K, coefficients, np.eye(3), pinhole.K, (312, 96), cv2.CV_32FC1
+    )
     stored = cv2.imread(str(depth), cv2.IMREAD_UNCHANGED).astype(np.float32) / 256
     wanted = cv2.remap(stored, *maps, cv2.INTER_NEAREST)
     source = f"png:{exact(world)}"
-    folder = DepthFolder(DepthConfig(source=source), FrameNumbers(FRAMES, 0, FRAMES), 312, 96, lens.apply_to_depth)
+    folder = DepthFolder(
+        DepthConfig(source=source), FrameNumbers(FRAMES, 0, FRAMES), 312, 96, lens.apply_to_depth
+    )
     found = 1 / folder.disparity(recording.frame(0))
     both = (wanted > 0) & np.isfinite(found)
     assert np.quantile(np.abs(found / wanted - 1)[both], 0.9) < 0.04  # half a pixel of the road
     np.testing.assert_array_equal(np.isfinite(found), wanted > 0)
-    assert run(world, tmp_path / "run", source, camera=camera, frames="0:7").metrics().status == "ok"
+    assert (
+        run(world, tmp_path / "run", source, camera=camera, frames="0:7").metrics().status == "ok"
+    )
 
 
 def test_a_relative_network_is_aligned_in_each_frame(world: Path, tmp_path: Path) -> None:
@@ -149,10 +177,14 @@ def test_a_relative_network_is_aligned_in_each_frame(world: Path, tmp_path: Path
     for path in sorted(exact(world).glob("*.png")):
         depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.float32) / 256
         disparity = np.where(depth > 0, 1 / np.maximum(depth, 0.1), 0)
-        np.save(folder / f"{path.stem}.npy", rng.uniform(3, 30) * (disparity + 0.02).astype(np.float32))
+        np.save(
+            folder / f"{path.stem}.npy", rng.uniform(3, 30) * (disparity + 0.02).astype(np.float32)
+        )
     chosen = ["depth.kind=disparity", "depth.align=affine"]
     metrics = run(world, tmp_path / "run", f"npy:{folder}", *chosen).metrics().tree()
-    assert metrics["trajectories"]["optimised"]["align"]["7dof"]["scale"] == pytest.approx(1.0, abs=0.08)
+    assert metrics["trajectories"]["optimised"]["align"]["7dof"]["scale"] == pytest.approx(
+        1.0, abs=0.08
+    )
     assert metrics["scale"]["spread"] < 0.15
 
 
@@ -161,12 +193,16 @@ def test_live_sessions_take_a_network_and_refuse_folders(
 ) -> None:
     sequence = open_sequence(world, "sim")
     config = load_config(None, [f"depth.source=onnx:{exported}"])
-    with Slam.from_weights(tiny_weights, sequence.intrinsics, config, sequence.camera_height_m) as session:
+    with Slam.from_weights(
+        tiny_weights, sequence.intrinsics, config, sequence.camera_height_m
+    ) as session:
         for k in range(6):
             session.add_frame(sequence.frame(k).image, 0.1 * k)
         assert len(session.trajectory()) == 6
     config = load_config(None, [f"depth.source=npy:{arrays}"])
-    with pytest.raises(SlamError, match=r"npy:.* needs a whole sequence.*: choose network or onnx:FILE"):
+    with pytest.raises(
+        SlamError, match=r"npy:.* needs a whole sequence.*: choose network or onnx:FILE"
+    ):
         Slam.from_weights(tiny_weights, sequence.intrinsics, config)
 
 
@@ -192,13 +228,32 @@ def test_bad_sources_are_one_line_and_exit_1(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (shutil.copytree(arrays, tmp_path / "short") / "000017.npy").unlink()
-    np.save(shutil.copytree(arrays, tmp_path / "pickled") / "000005.npy", np.array([[print]]), allow_pickle=True)
+    np.save(
+        shutil.copytree(arrays, tmp_path / "pickled") / "000005.npy",
+        np.array([[print]]),
+        allow_pickle=True,
+    )
     (tmp_path / "unknown").mkdir()
     for k in range(FRAMES):
-        np.save(tmp_path / "unknown" / f"{k}.npy", np.full((48, 156), [np.nan, 0.0, -1.0, np.inf][k % 4], np.float32))
+        np.save(
+            tmp_path / "unknown" / f"{k}.npy",
+            np.full((48, 156), [np.nan, 0.0, -1.0, np.inf][k % 4], np.float32),
+        )
     (tmp_path / "damaged.onnx").write_bytes(b"\x08\x07" * 99)
-    words = ["run", "--dataset", world, "--weights", "sim", "--output", "out", "--set", f"depth.source={source}"]
+    words = [
+        "run",
+        "--dataset",
+        world,
+        "--weights",
+        "sim",
+        "--output",
+        "out",
+        "--set",
+        f"depth.source={source}",
+    ]
     code, _, err = command_line(slam.commands.cli.main, "erfsfm-slam", *words)
     (line,) = [each for each in err.strip().splitlines() if not each.startswith("WARNING")]
     assert code == 1 and message in line
-    assert (tmp_path / "out").exists() == (source == "npy:unknown"), "all else is found before the run begins"
+    assert (tmp_path / "out").exists() == (source == "npy:unknown"), (
+        "all else is found before the run begins"
+    )

@@ -15,7 +15,9 @@ def test_default_file_is_the_defaults_complete_and_explained():
 
 
 def test_dump_reads_back(tmp_path):
-    config = load_config(None, ["mapping.keyframe_distance_m=1e-4", "gps.correlation_s=7", "scale.mode=none"])
+    config = load_config(
+        None, ["mapping.keyframe_distance_m=1e-4", "gps.correlation_s=7", "scale.mode=none"]
+    )
     assert config.mapping.keyframe_distance_m == 1e-4
     assert config.gps.correlation_s == 7
     path = tmp_path / "mine.yaml"

@@ -29,7 +29,9 @@ def test_correct_sigmas_cover() -> None:
     rng = np.random.default_rng(0)
     errors = DepthErrors()
     for _ in range(20):
-        errors.add(TRUTH * np.exp(rng.normal(0, 0.05, TRUTH.shape)), TRUTH, np.full_like(TRUTH, 0.05))
+        errors.add(
+            TRUTH * np.exp(rng.normal(0, 0.05, TRUTH.shape)), TRUTH, np.full_like(TRUTH, 0.05)
+        )
     summary = errors.metrics().tree()
     for level in (50, 90, 95):
         assert summary["coverage"][str(level)] == pytest.approx(level / 100, abs=0.02)

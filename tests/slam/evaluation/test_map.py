@@ -68,11 +68,15 @@ def straight(frames: int = 21, step_m: float = 1.0) -> FloatArray:
 
 def errors(points: FloatArray, exact: bool = False) -> dict[str, Any]:
     truth = Road(road(), np.arange(21), exact)
-    return PlacedMetrics.of(**placed_errors(compare(truth, straight(), {"map": points})[0]["map"])).tree()
+    return PlacedMetrics.of(
+        **placed_errors(compare(truth, straight(), {"map": points})[0]["map"])
+    ).tree()
 
 
 @pytest.mark.parametrize("exact", [False, True])
-@pytest.mark.parametrize(("offset_m", "covered", "f_scores"), [(0.1, 1, (1, 1)), (0.25, 1, (0, 1)), (0.4, 0, (0, 1))])
+@pytest.mark.parametrize(
+    ("offset_m", "covered", "f_scores"), [(0.1, 1, (1, 1)), (0.25, 1, (0, 1)), (0.4, 0, (0, 1))]
+)
 def test_a_raised_plane_is_wrong_by_its_offset(
     offset_m: float, covered: float, f_scores: tuple[float, float], exact: bool
 ) -> None:
@@ -109,11 +113,18 @@ def test_the_curve_is_over_the_distance_from_the_nearest_camera() -> None:
     points = road(36.0)
     points[np.abs(points[:, 0]) > 9.0, 1] -= 0.35
     truth = Road(road(36.0), np.arange(21))
-    found = PlacedMetrics.of(**placed_errors(compare(truth, straight(), {"map": points})[0]["map"])).tree()
+    found = PlacedMetrics.of(
+        **placed_errors(compare(truth, straight(), {"map": points})[0]["map"])
+    ).tree()
     near, _, _, far, beyond = found["by_distance"]
     assert (near["from_m"], near["to_m"], beyond["to_m"]) == (0.0, 5.0, 25.0)
-    assert near["accuracy_median_m"] == pytest.approx(0.0, abs=CLOSE_M) and near["f_score"]["0.2"] == 1.0
-    assert far["accuracy_median_m"] == pytest.approx(0.35, abs=CLOSE_M) and far["completeness"] < 0.1
+    assert (
+        near["accuracy_median_m"] == pytest.approx(0.0, abs=CLOSE_M)
+        and near["f_score"]["0.2"] == 1.0
+    )
+    assert (
+        far["accuracy_median_m"] == pytest.approx(0.35, abs=CLOSE_M) and far["completeness"] < 0.1
+    )
     assert far["f_score"] == {"0.2": 0.0, "0.5": 1.0}
     assert "too few" in beyond["f_score"]["0.2_reason"] and beyond["completeness"] is None
 
@@ -121,13 +132,18 @@ def test_the_curve_is_over_the_distance_from_the_nearest_camera() -> None:
 def test_an_empty_map_has_reasons_and_covers_nothing() -> None:
     found = errors(np.array([[0.0, 90.0, 0.0]]))
     assert found["completeness"] == 0.0 and found["accuracy_median_m"] is None
-    assert "no map point" in found["accuracy_median_m_reason"] and "no map point" in found["f_score"]["0.2_reason"]
+    assert (
+        "no map point" in found["accuracy_median_m_reason"]
+        and "no map point" in found["f_score"]["0.2_reason"]
+    )
 
 
 def test_only_the_road_of_known_surface_counts() -> None:
     truth = Road(road(), np.arange(21))
     distances, length_m = compare(
-        truth, straight(200), {"map": np.concatenate([road(), road() + np.array([0.0, 0.0, 100.0])])}
+        truth,
+        straight(200),
+        {"map": np.concatenate([road(), road() + np.array([0.0, 0.0, 100.0])])},
     )
     assert placed_errors(distances["map"])["outlier_share"] == 0.0
     assert length_m == pytest.approx(26.0)
@@ -156,11 +172,15 @@ def test_a_point_in_an_image_takes_the_place_of_one_beside_it() -> None:
 
 
 def test_depth_becomes_points_in_the_world() -> None:
-    rays = Intrinsics(21, 11, 50.0, 50.0, 10.0, 5.0).rays(Intrinsics(21, 11, 50.0, 50.0, 10.0, 5.0).pixel_grid())
+    rays = Intrinsics(21, 11, 50.0, 50.0, 10.0, 5.0).rays(
+        Intrinsics(21, 11, 50.0, 50.0, 10.0, 5.0).pixel_grid()
+    )
     depth = np.full((11, 21), 8.0)
     depth[:, 0] = 0.0  # nothing there
     depth[:, 20] = 20.0  # a ray longer than 20 m
-    T_world_camera = se3.from_rotation_vector(np.array([0.0, np.pi / 2, 0.0]), np.array([1.0, 2.0, 3.0]))
+    T_world_camera = se3.from_rotation_vector(
+        np.array([0.0, np.pi / 2, 0.0]), np.array([1.0, 2.0, 3.0])
+    )
     points = backprojected(depth, rays, T_world_camera, 20.0)
     assert points.shape == (11 * 19, 3)
     # the camera looks along +x of the world: its own x axis is -z there
@@ -175,7 +195,9 @@ def drive(frames: int = 40) -> FloatArray:
 
 def test_similarity_undoes_one() -> None:
     truth = drive()
-    moved = se3.Similarity(0.2, se3.from_rotation_vector(np.array([0.3, -1.0, 0.2]), np.zeros(3))[:3, :3], np.ones(3))
+    moved = se3.Similarity(
+        0.2, se3.from_rotation_vector(np.array([0.3, -1.0, 0.2]), np.zeros(3))[:3, :3], np.ones(3)
+    )
     back = pose_similarity(truth, moved.apply_to_poses(truth))
     assert back.scale == pytest.approx(5.0)
     np.testing.assert_allclose(back.apply_to_poses(moved.apply_to_poses(truth)), truth, atol=1e-9)
@@ -189,7 +211,9 @@ def test_similarity_keeps_the_roll_of_a_straight_road() -> None:
     rng = np.random.default_rng(0)
     truth = np.tile(np.eye(4), (50, 1, 1))
     truth[:, 2, 3] = np.arange(50)
-    noisy = truth @ se3.from_rotation_vector(0.005 * rng.normal(size=(50, 3)), 0.05 * rng.normal(size=(50, 3)))
+    noisy = truth @ se3.from_rotation_vector(
+        0.005 * rng.normal(size=(50, 3)), 0.05 * rng.normal(size=(50, 3))
+    )
     roll = se3.rotation_angle(pose_similarity(truth, noisy).R_a_b)
     assert roll < np.deg2rad(0.3)
 
@@ -197,8 +221,12 @@ def test_similarity_keeps_the_roll_of_a_straight_road() -> None:
 def test_positions_of_a_long_drive_outweigh_a_constant_error_of_its_orientations() -> None:
     truth = straight(200)
     tilted = truth.copy()
-    tilted[:, :3, :3] = se3.from_rotation_vector(np.array([np.deg2rad(1.0), 0.0, 0.0]), np.zeros(3))[:3, :3]
-    assert se3.rotation_angle(pose_similarity(truth, tilted, with_scale=False).R_a_b) < np.deg2rad(0.1)
+    tilted[:, :3, :3] = se3.from_rotation_vector(
+        np.array([np.deg2rad(1.0), 0.0, 0.0]), np.zeros(3)
+    )[:3, :3]
+    assert se3.rotation_angle(pose_similarity(truth, tilted, with_scale=False).R_a_b) < np.deg2rad(
+        0.1
+    )
 
 
 SQUARE = np.array([[0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0]], float)
@@ -208,7 +236,9 @@ TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])  # looks along z
 @pytest.mark.parametrize(("distance", "share"), [(0.1, 0.0), (1.0, 0.5), (1.9, 0.5), (2.5, 0.0)])
 def test_the_surface_behind_another_counts(distance: float, share: float):
     vertices = np.concatenate([SQUARE, SQUARE + np.array([0, 0, distance])])
-    assert double_wall_share([(vertices, np.concatenate([TRIANGLES, TRIANGLES + 4]))]) == pytest.approx(share)
+    assert double_wall_share(
+        [(vertices, np.concatenate([TRIANGLES, TRIANGLES + 4]))]
+    ) == pytest.approx(share)
 
 
 def test_the_two_sides_of_a_body_are_not_a_double_wall():

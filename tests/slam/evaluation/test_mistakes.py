@@ -14,14 +14,20 @@ from slam.geometry.se3 import FloatArray
 RATE_HZ = 10.0
 
 
-def drive(count: int = 300, noise_m: float = 0.03, start_s: float = 0.0, rate_hz: float = RATE_HZ) -> Trajectory:
+def drive(
+    count: int = 300, noise_m: float = 0.03, start_s: float = 0.0, rate_hz: float = RATE_HZ
+) -> Trajectory:
     """A winding drive up and down hills at changing speed, looking ahead."""
     stamps = start_s + np.arange(count) / rate_hz
     t = stamps - 0.7 * np.sin(0.9 * stamps)
     heading = 0.25 * t + 0.6 * np.sin(0.31 * t)
-    positions = np.column_stack([25 * np.sin(0.25 * t), 3 * np.sin(0.5 * t), 40 * np.sin(0.11 * t) + 2 * t])
+    positions = np.column_stack(
+        [25 * np.sin(0.25 * t), 3 * np.sin(0.5 * t), 40 * np.sin(0.11 * t) + 2 * t]
+    )
     positions += np.random.default_rng(0).normal(0, noise_m, positions.shape)
-    turns = Rotation.from_euler("YXZ", np.column_stack([heading, 0.1 * np.sin(t), 0.05 * np.cos(0.7 * t)]))
+    turns = Rotation.from_euler(
+        "YXZ", np.column_stack([heading, 0.1 * np.sin(t), 0.05 * np.cos(0.7 * t)])
+    )
     return Trajectory(stamps, se3.make(turns.as_matrix(), positions))
 
 
@@ -37,7 +43,9 @@ def test_nothing_is_said_of_noise() -> None:
     truth = drive(noise_m=0.0)
     for noise_m in (0.0, 0.03, 1.0, 20.0):
         assert said(drive(noise_m=noise_m), truth) == []
-    turned = drive().T_world_camera @ se3.from_rotation_vector(np.array([0.02, 0.0, 0.0]), np.zeros(3))
+    turned = drive().T_world_camera @ se3.from_rotation_vector(
+        np.array([0.02, 0.0, 0.0]), np.zeros(3)
+    )
     assert said(changed(truth, turned), truth) == []
     straight = np.tile(np.eye(4), (100, 1, 1))
     straight[:, 2, 3] = np.arange(100)
@@ -60,7 +68,8 @@ def test_a_clock_that_runs_faster_and_frame_numbers_that_are_late() -> None:
     assert "run faster" in line
     late = drive().T_world_camera[np.maximum(np.arange(300) - 5, 0)]
     (line,) = said(
-        Trajectory(np.arange(300.0), late, timed=False), replace(truth, stamps=np.arange(300.0), timed=False)
+        Trajectory(np.arange(300.0), late, timed=False),
+        replace(truth, stamps=np.arange(300.0), timed=False),
     )
     assert "frame numbers by -5" in line
 
@@ -73,7 +82,10 @@ def test_a_clock_that_runs_faster_and_frame_numbers_that_are_late() -> None:
         (lambda T: se3.make(T[:, :3, :3], T[:, :3, 3] * [1, 1, -1]), "left-handed"),
         (lambda T: se3.make(T[:, :3, :3], 1000 * T[:, :3, 3]), "millimetres"),
         (lambda T: se3.make(np.swapaxes(T[:, :3, :3], 1, 2), T[:, :3, 3]), "Transposed"),
-        (lambda T: T @ se3.from_rotation_vector(np.array([0.0, np.pi / 2, 0.0]), np.zeros(3)), "90 degrees"),
+        (
+            lambda T: T @ se3.from_rotation_vector(np.array([0.0, np.pi / 2, 0.0]), np.zeros(3)),
+            "90 degrees",
+        ),
     ],
 )
 def test_what_was_done_is_named(mistake, words: str) -> None:

@@ -35,7 +35,9 @@ def moved(trajectory: Trajectory, scale: float) -> Trajectory:
     return Trajectory(trajectory.stamps, similarity.apply_to_poses(trajectory.T_world_camera))
 
 
-def test_alignment_removes_a_similarity_and_drift_is_then_zero(make_run: Callable[..., RunFolder]) -> None:
+def test_alignment_removes_a_similarity_and_drift_is_then_zero(
+    make_run: Callable[..., RunFolder],
+) -> None:
     reference = make_run().trajectory("reference")
     assert reference is not None
     fitted = aligned({"reference": reference, "optimised": moved(reference, 0.2)})["optimised"]
@@ -72,7 +74,9 @@ def trajectory(T_world_camera: FloatArray) -> Trajectory:
 def drive(frames: int = 400, step_m: float = 1.0) -> FloatArray:
     """A winding, hilly drive ``(N, 4, 4)`` from the identity."""
     k = np.arange(frames - 1)
-    turns = np.stack([0.01 * np.sin(0.07 * k), 0.03 * np.cos(0.02 * k), 0.002 * np.sin(0.11 * k)], axis=1)
+    turns = np.stack(
+        [0.01 * np.sin(0.07 * k), 0.03 * np.cos(0.02 * k), 0.002 * np.sin(0.11 * k)], axis=1
+    )
     return se3.chain(se3.from_rotation_vector(turns, np.tile([0.0, 0.0, step_m], (frames - 1, 1))))
 
 
@@ -132,17 +136,23 @@ def test_a_known_similarity_under_each_alignment() -> None:
 
 def test_a_noisy_estimate_agrees_with_evo() -> None:
     rng = np.random.default_rng(7)
-    noise = se3.from_rotation_vector(rng.normal(scale=0.02, size=(400, 3)), rng.normal(scale=0.5, size=(400, 3)))
+    noise = se3.from_rotation_vector(
+        rng.normal(scale=0.02, size=(400, 3)), rng.normal(scale=0.5, size=(400, 3))
+    )
     metrics = metrics_of(trajectory(drive() @ noise), trajectory(drive()))
     assert 0.5 < metrics["evo"]["ape_rmse_m_7dof"] < 1.0
-    assert metrics["evo"]["ape_rmse_m_7dof"] == pytest.approx(metrics["align"]["7dof"]["ate_rmse_m"], abs=1e-9)
+    assert metrics["evo"]["ape_rmse_m_7dof"] == pytest.approx(
+        metrics["align"]["7dof"]["ate_rmse_m"], abs=1e-9
+    )
     assert metrics["evo"]["difference"] < 1e-6
 
 
 def test_hand_values_of_segments_and_steps() -> None:
     """A straight line whose estimate is 2 % long and turns 0.001 rad a metre about its own axis of motion."""
     truth, estimate = line(251), line(251, 1.02)
-    estimate[:, :3, :3] = Rotation.from_rotvec(np.outer(0.001 * np.arange(251), [0.0, 0.0, 1.0])).as_matrix()
+    estimate[:, :3, :3] = Rotation.from_rotvec(
+        np.outer(0.001 * np.arange(251), [0.0, 0.0, 1.0])
+    ).as_matrix()
     record = metrics_of(trajectory(estimate), trajectory(truth))["align"]["first"]
     # A segment of L m ends at the first frame beyond: L + 1 steps. Starts 0 to 140 hold 100 m, 0 to 40 200 m.
     share = (15 * 101 / 100 + 5 * 201 / 200) / 20
@@ -157,7 +167,10 @@ def test_short_paths_have_no_segments(frames: int, fits: bool) -> None:
     record = metrics_of(trajectory(line(frames)), trajectory(line(frames)))["align"]["none"]
     assert (record["t_rel_percent"] is not None) == fits
     if not fits:
-        assert record["t_rel_percent_reason"] == f"no segment of 100 m fits into the path of {frames - 1}.0 m"
+        assert (
+            record["t_rel_percent_reason"]
+            == f"no segment of 100 m fits into the path of {frames - 1}.0 m"
+        )
         assert record["r_rel_deg_per_100m"] is None
 
 
@@ -167,7 +180,13 @@ def test_without_a_reference_every_number_has_a_reason() -> None:
     assert metrics["snippet5"]["count_reason"] == "there is no reference trajectory"
     assert set(ate(metrics).values()) == {None}
     given = metrics_of(trajectory(drive(10)), None, SnippetErrors(0.1, 0.2, 0.3, 0.4, 5))
-    assert given["snippet5"] == {"ate_mean": 0.1, "ate_std": 0.2, "re_mean": 0.3, "re_std": 0.4, "count": 5}
+    assert given["snippet5"] == {
+        "ate_mean": 0.1,
+        "ate_std": 0.2,
+        "re_mean": 0.3,
+        "re_std": 0.4,
+        "count": 5,
+    }
 
 
 def test_an_estimate_that_stands_still_has_no_scale() -> None:
@@ -194,14 +213,18 @@ def test_a_reference_that_stands_still_cannot_be_scaled_to() -> None:
     assert "the reference does not move" in snippets["ate_mean_reason"]
     assert snippets["re_mean"] > 0 and snippets["count"] == 16  # rotations have no scale
     direct = metrics_of(
-        trajectory(drive(20)), trajectory(np.tile(np.eye(4), (20, 1, 1))), SnippetErrors(0.0, 0.0, 0.3, 0.4, 5)
+        trajectory(drive(20)),
+        trajectory(np.tile(np.eye(4), (20, 1, 1))),
+        SnippetErrors(0.0, 0.0, 0.3, 0.4, 5),
     )
     assert direct["snippet5"]["ate_mean"] is None and direct["snippet5"]["re_mean"] == 0.3
 
 
 def test_a_camera_that_turns_on_the_spot_has_errors_of_rotation() -> None:
     turning = np.tile(np.eye(4), (20, 1, 1))
-    turning[:, :3, :3] = Rotation.from_rotvec(np.outer(np.deg2rad(np.arange(20)), [0, 1, 0])).as_matrix()
+    turning[:, :3, :3] = Rotation.from_rotvec(
+        np.outer(np.deg2rad(np.arange(20)), [0, 1, 0])
+    ).as_matrix()
     metrics = metrics_of(trajectory(np.tile(np.eye(4), (20, 1, 1))), trajectory(turning))
     assert metrics["align"]["first"]["rpe_rot_deg"] == pytest.approx(1.0)
 
@@ -229,10 +252,17 @@ def test_one_and_two_frames(frames: int, known: set[str]) -> None:
     [
         (line(20, 0.0), line(20, 0.0), "none", "neither the estimate nor the reference moves"),
         (line(20, -1.0), line(20), "scale", "the other way"),
-        (np.where(np.arange(20)[:, None, None] == 11, np.nan, line(20)), line(20), "none", "not finite"),
+        (
+            np.where(np.arange(20)[:, None, None] == 11, np.nan, line(20)),
+            line(20),
+            "none",
+            "not finite",
+        ),
     ],
 )
-def test_what_has_no_error_has_a_reason(estimate: FloatArray, truth: FloatArray, alignment: str, reason: str) -> None:
+def test_what_has_no_error_has_a_reason(
+    estimate: FloatArray, truth: FloatArray, alignment: str, reason: str
+) -> None:
     metrics = metrics_of(trajectory(estimate), trajectory(truth))
     check_shape(metrics)
     assert reason in metrics["align"][alignment]["ate_rmse_m_reason"]
@@ -243,7 +273,15 @@ def test_limits() -> None:
     rough[::2, 1, 3] += 0.2
     metrics = trajectory_metrics(trajectory(rough), trajectory(drive(60)))
     assert (
-        exceeded(metrics, ["ate_rmse_m=1", "align.none.ate_rmse_m = 0.5", "snippet5.ate_mean=1", "evo.difference=1e-6"])
+        exceeded(
+            metrics,
+            [
+                "ate_rmse_m=1",
+                "align.none.ate_rmse_m = 0.5",
+                "snippet5.ate_mean=1",
+                "evo.difference=1e-6",
+            ],
+        )
         == []
     )
     lines = exceeded(metrics, ["ate_rmse_m=0.01", "align.first.rpe_rot_deg=1", "t_rel_percent=5"])
@@ -261,10 +299,16 @@ def test_limits() -> None:
         ("10", [3.721, 2.293, 0.369, 0.047, 0.043], [3.356, 2.221, 0.369, 0.047, 0.043]),
     ],
 )
-def test_golden_numbers(data_root: Path, sequence: str, six: list[float], seven: list[float]) -> None:
+def test_golden_numbers(
+    data_root: Path, sequence: str, six: list[float], seven: list[float]
+) -> None:
     """DF-VO's stereo-trained trajectories, as kitti-odom-eval scores them, to every printed digit."""
-    files = (data_root / "golden" / f"{kind}_{sequence}.txt" for kind in ("dfvo_stereo", "reference"))
+    files = (
+        data_root / "golden" / f"{kind}_{sequence}.txt" for kind in ("dfvo_stereo", "reference")
+    )
     metrics = metrics_of(*map(read_trajectory, files))
     for alignment, expected in (("6dof", six), ("7dof", seven)):
-        assert [round(metrics["align"][alignment][key], 3) for key in AlignedMetrics.names()[:5]] == expected
+        assert [
+            round(metrics["align"][alignment][key], 3) for key in AlignedMetrics.names()[:5]
+        ] == expected
     assert metrics["evo"]["difference"] < 1e-6

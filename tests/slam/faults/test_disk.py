@@ -19,11 +19,16 @@ Call = Callable[..., tuple[int, str, str]]
 @contextmanager
 def full_disk(largest: int) -> Iterator[None]:
     """No file may grow beyond a number of bytes, whoever writes it."""
-    limit, before = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    limit, before = (
+        resource.getrlimit(resource.RLIMIT_FSIZE),
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN),
+    )
     resource.setrlimit(resource.RLIMIT_FSIZE, (largest, limit[1]))
     try:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setenv("PATH", "")  # git would die of it, and leave the index of this checkout locked
+            patch.setenv(
+                "PATH", ""
+            )  # git would die of it, and leave the index of this checkout locked
             yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
@@ -35,10 +40,17 @@ def run(kitti_root: Path, tiny_weights: Path, tmp_path: Path) -> list[str]:
     """A quick run."""
     words = ["run", "--dataset", str(kitti_root), "--weights", str(tiny_weights), "--frames", "0:6"]
     quick = ("visual_odometry.enabled=false", "mapping.enabled=false", "output.report=false")
-    return [*words, *(word for each in quick for word in ("--set", each)), "--output", str(tmp_path / "out")]
+    return [
+        *words,
+        *(word for each in quick for word in ("--set", each)),
+        "--output",
+        str(tmp_path / "out"),
+    ]
 
 
-def test_a_run_on_a_full_disk_is_one_line(run: list[str], command_line: Call, tmp_path: Path) -> None:
+def test_a_run_on_a_full_disk_is_one_line(
+    run: list[str], command_line: Call, tmp_path: Path
+) -> None:
     with full_disk(200):
         code, _, err = command_line(slam_main, "erfsfm-slam", *run)
     said = [line for line in err.splitlines() if line.startswith("erfsfm-slam: ")]
@@ -53,6 +65,9 @@ def test_a_prediction_is_whole_or_absent(
     images, out = kitti_root / "sequences/sim/image_2", tmp_path / "depth"
     with full_disk(200):
         assert (
-            command_line(erfsfm_main, "erfsfm", "predict", images, "--weights", tiny_weights, "--output", out)[0] == 1
+            command_line(
+                erfsfm_main, "erfsfm", "predict", images, "--weights", tiny_weights, "--output", out
+            )[0]
+            == 1
         )
     assert not list(out.iterdir())

@@ -44,12 +44,43 @@ from slam.results.metrics import LoopsFile, Metrics
 from slam.runtime.errors import SlamError
 from slam.sequences.catalogue import open_sequence
 
-FEW = settings(max_examples=12, derandomize=True, deadline=None, database=None, suppress_health_check=[*HealthCheck])
+FEW = settings(
+    max_examples=12,
+    derandomize=True,
+    deadline=None,
+    database=None,
+    suppress_health_check=[*HealthCheck],
+)
 
 _NUMBER = re.compile(rb"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
 _HOSTILE = (
-    *(b"nan", b"inf", b"-inf", b"1e999", b"-1", b"0", b"1000000000000", b"9" * 60, b"1e308", b"1e-308", b"''"),
-    *(b"null", b"true", b"[]", b"{}", b"[[1]]", b'"x"', b"\\ud800", b"x", b"0x10", b"1_0", b"", b"~"),
+    *(
+        b"nan",
+        b"inf",
+        b"-inf",
+        b"1e999",
+        b"-1",
+        b"0",
+        b"1000000000000",
+        b"9" * 60,
+        b"1e308",
+        b"1e-308",
+        b"''",
+    ),
+    *(
+        b"null",
+        b"true",
+        b"[]",
+        b"{}",
+        b"[[1]]",
+        b'"x"',
+        b"\\ud800",
+        b"x",
+        b"0x10",
+        b"1_0",
+        b"",
+        b"~",
+    ),
     b"!!python/name:os",
 )
 _LINE_ENDS = (b"\r\n", b"\r", b"\n\n", b"\x00", b" \n", b"\xc2\x85")
@@ -67,7 +98,9 @@ def damaged(draw: st.DrawFn, content: bytes) -> bytes:
             return content[:place]
         case "flip":
             return (
-                content[:place] + bytes([content[place] ^ 1 << draw(st.integers(0, 7))]) + content[place + 1 :]
+                content[:place]
+                + bytes([content[place] ^ 1 << draw(st.integers(0, 7))])
+                + content[place + 1 :]
                 if (place < size)
                 else content
             )
@@ -85,7 +118,11 @@ def damaged(draw: st.DrawFn, content: bytes) -> bytes:
             if not found:
                 return b""
             number = draw(st.sampled_from(found))
-            return content[: number.start()] + draw(st.sampled_from(_HOSTILE)) + content[number.end() :]
+            return (
+                content[: number.start()]
+                + draw(st.sampled_from(_HOSTILE))
+                + content[number.end() :]
+            )
         case "line ends":
             return content.replace(b"\n", draw(st.sampled_from(_LINE_ENDS)))
         case "encoding":
@@ -98,7 +135,18 @@ def damaged(draw: st.DrawFn, content: bytes) -> bytes:
 
 
 _CHANGES = (
-    *("cut", "flip", "overwrite", "insert", "remove", "repeat", "number", "number", "line ends", "encoding"),
+    *(
+        "cut",
+        "flip",
+        "overwrite",
+        "insert",
+        "remove",
+        "repeat",
+        "number",
+        "number",
+        "line ends",
+        "encoding",
+    ),
     "duplicate lines",
 )
 
@@ -138,7 +186,9 @@ def _is_trajectory(trajectory: Trajectory) -> bool:
 
 def _is_sequence(sequence: Any) -> bool:
     poses = sequence.reference
-    return bool((np.diff(sequence.stamps) > 0).all()) and (poses is None or se3.is_se3(poses, tolerance=1e-3))
+    return bool((np.diff(sequence.stamps) > 0).all()) and (
+        poses is None or se3.is_se3(poses, tolerance=1e-3)
+    )
 
 
 def _odometry_poses(path: Path) -> Any:
@@ -167,13 +217,30 @@ READERS = (
     Reader("KITTI calibration", "root/sequences/sim/calib.txt", _root, _is_sequence),
     Reader("KITTI times", "root/sequences/sim/times.txt", _root, _is_sequence),
     Reader("KITTI poses", "run/trajectory_optimised.kitti.txt", read_trajectory, _is_trajectory),
-    Reader("KITTI poses, training", "root/poses/sim.txt", _odometry_poses, lambda T: bool(np.isfinite(T).all())),
+    Reader(
+        "KITTI poses, training",
+        "root/poses/sim.txt",
+        _odometry_poses,
+        lambda T: bool(np.isfinite(T).all()),
+    ),
     Reader("TUM poses", "run/trajectory_optimised.tum.txt", read_trajectory, _is_trajectory),
-    Reader("TUM images", "tum/rgb.txt", lambda path: open_sequence(path.parent, None, None, None), _is_sequence),
-    Reader("folder times", "folder/times.txt", lambda path: open_sequence(path.parent, None, None, None), _is_sequence),
+    Reader(
+        "TUM images",
+        "tum/rgb.txt",
+        lambda path: open_sequence(path.parent, None, None, None),
+        _is_sequence,
+    ),
+    Reader(
+        "folder times",
+        "folder/times.txt",
+        lambda path: open_sequence(path.parent, None, None, None),
+        _is_sequence,
+    ),
     Reader("EuRoC images", "euroc/mav0/cam0/data.csv", _euroc, _is_sequence),
     Reader("EuRoC camera", "euroc/mav0/cam0/sensor.yaml", _euroc, _is_sequence),
-    Reader("OXTS packet", "packet.txt", read_packet, lambda packet: bool(np.isfinite(packet).all())),
+    Reader(
+        "OXTS packet", "packet.txt", read_packet, lambda packet: bool(np.isfinite(packet).all())
+    ),
     Reader("metrics.json", "run/metrics.json", Metrics.read),
     Reader("loops.json", "run/loops.json", LoopsFile.read),
     Reader("places.npz", "run/places.npz", Places.read),
@@ -195,7 +262,9 @@ def samples(tmp_path_factory: pytest.TempPathFactory, kitti_root: Path, tiny_wei
     for suffix in ("png", "jpg", "bmp"):
         cv2.imwrite(str(place / f"image.{suffix}"), image)
     cv2.imwrite(str(place / "depth.png"), image[..., 0].astype(np.uint16) * 257)
-    video = cv2.VideoWriter(str(place / "drive.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10, image.shape[1::-1])
+    video = cv2.VideoWriter(
+        str(place / "drive.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10, image.shape[1::-1]
+    )
     for path in images:
         video.write(cv2.imread(str(path)))
     video.release()
@@ -203,25 +272,38 @@ def samples(tmp_path_factory: pytest.TempPathFactory, kitti_root: Path, tiny_wei
     shutil.copy(kitti_root / "camera.yaml", place / "tum")
     for path in images:
         shutil.copy(path, place / "tum/rgb")
-    (place / "tum/rgb.txt").write_text("".join(f"{k / 10} rgb/{path.name}\n" for k, path in enumerate(images)))
+    (place / "tum/rgb.txt").write_text(
+        "".join(f"{k / 10} rgb/{path.name}\n" for k, path in enumerate(images))
+    )
     shutil.copytree(place / "tum/rgb", place / "folder")
     shutil.copy(kitti_root / "camera.yaml", place / "folder")
     (place / "folder/times.txt").write_text("".join(f"{k / 10}\n" for k in range(len(images))))
     _write_euroc(place / "euroc/mav0/cam0", images)
     (place / "packet.txt").write_text(" ".join(["49.01", "8.43", *["0.5"] * 28]))
-    (place / "split.yaml").write_text("train: [kitti_raw/a]\nvalidation: []\ntest: ['kitti_raw/b[0:10]']\n")
+    (place / "split.yaml").write_text(
+        "train: [kitti_raw/a]\nvalidation: []\ntest: ['kitti_raw/b[0:10]']\n"
+    )
     shutil.copy(Path(__file__).parents[3] / "configs/erfsfm/tiny.yaml", place / "training.yaml")
     triangle = np.eye(3)
     write_ply(place / "mesh.ply", coloured_ply(triangle, triangle, triangle, np.array([[0, 1, 2]])))
     _write_old_checkpoint(place / "old.pth.tar")
     overrides = ["output.report=false", "visual_odometry.enabled=false"]
-    run_slam(kitti_root, "sim", weights=tiny_weights, output=place / "run", frames="0:8", overrides=overrides)
+    run_slam(
+        kitti_root,
+        "sim",
+        weights=tiny_weights,
+        output=place / "run",
+        frames="0:8",
+        overrides=overrides,
+    )
     return place
 
 
 def _write_old_checkpoint(path: Path) -> None:
     tensors = {f"conv{level}.0.weight": torch.ones(4, 3, 3, 3) for level in range(1, 8)}
-    torch.save({"epoch": 1, "state_dict": {"conv1.0.weight": torch.ones(16, 3, 7, 7)} | tensors}, path)
+    torch.save(
+        {"epoch": 1, "state_dict": {"conv1.0.weight": torch.ones(16, 3, 7, 7)} | tensors}, path
+    )
 
 
 def _write_euroc(camera: Path, images: list[Path]) -> None:
@@ -233,7 +315,9 @@ def _write_euroc(camera: Path, images: list[Path]) -> None:
     (camera / "data.csv").write_text("\n".join(rows))
     height, width = cv2.imread(str(images[0])).shape[:2]
     pose = "T_BS:\n  cols: 4\n  rows: 4\n  data: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n"
-    lens = "camera_model: pinhole\nintrinsics: [60, 60, 47, 31]\ndistortion_model: radial-tangential\n"
+    lens = (
+        "camera_model: pinhole\nintrinsics: [60, 60, 47, 31]\ndistortion_model: radial-tangential\n"
+    )
     lens += "distortion_coefficients: [0.0, 0.0, 0.0, 0.0]\n"
     (camera / "sensor.yaml").write_text(
         f"sensor_type: camera\n{pose}rate_hz: 10\nresolution: [{width}, {height}]\n{lens}"
@@ -249,7 +333,9 @@ def readable(samples: Path, tmp_path: Path, reader: Reader) -> Path:
     else:
         shutil.copy(samples / top, tmp_path)
     path = tmp_path / reader.file
-    assert reader.name == "checkpoint of SfMLearner" or reader.read(path) is not Ellipsis, "a sample can be read"
+    assert reader.name == "checkpoint of SfMLearner" or reader.read(path) is not Ellipsis, (
+        "a sample can be read"
+    )
     return path
 
 
@@ -259,7 +345,9 @@ def check_line(line: str, path: Path, place: Path) -> None:
 
 
 @pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
-def test_a_damaged_file_is_read_or_refused_in_one_line(reader: Reader, readable: Path, tmp_path: Path) -> None:
+def test_a_damaged_file_is_read_or_refused_in_one_line(
+    reader: Reader, readable: Path, tmp_path: Path
+) -> None:
     @FEW
     @given(damaged(readable.read_bytes()))
     def hold(content: bytes) -> None:
@@ -277,7 +365,9 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(reader: Reader, readable:
 
 
 @pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
-def test_a_folder_in_the_place_of_a_file_is_refused(reader: Reader, readable: Path, tmp_path: Path) -> None:
+def test_a_folder_in_the_place_of_a_file_is_refused(
+    reader: Reader, readable: Path, tmp_path: Path
+) -> None:
     readable.unlink()
     readable.mkdir()
     with pytest.raises((SlamError, ErfsfmError)) as raised:

@@ -31,12 +31,17 @@ def rows(path: Path) -> list[list[str]]:
 
 def lines_of(path: Path) -> list[list[float | str]]:
     """Its rows, numbers as numbers."""
-    return [[word if word[0].isalpha() or "png" in word else float(word) for word in row] for row in rows(path)]
+    return [
+        [word if word[0].isalpha() or "png" in word else float(word) for word in row]
+        for row in rows(path)
+    ]
 
 
 def binary_rows(folder: Path) -> list[list[list[float | str]]]:
     """A model in COLMAP's binary form, as its documentation has it, as the rows of the text form."""
-    cameras, images, points = (io.BytesIO((folder / f"{Path(name).stem}.bin").read_bytes()) for name in TEXTS)
+    cameras, images, points = (
+        io.BytesIO((folder / f"{Path(name).stem}.bin").read_bytes()) for name in TEXTS
+    )
 
     def take(file: io.BytesIO, form: str) -> tuple[float, ...]:
         return struct.unpack(f"<{form}", file.read(struct.calcsize(f"<{form}")))
@@ -63,7 +68,12 @@ def test_a_model_reads_back(tmp_path: Path) -> None:
     seen = Sightings(np.array([3, 0, 3]), pixels, np.array([1, 1, 0]), np.array([0.25, 0.75, 1.0]))
     write_colmap(tmp_path / "new" / "model", CAMERA, drive(), POINTS, COLOURS, seen)
     folder = tmp_path / "new" / "model"
-    assert {path.name for path in folder.iterdir()} == {"cameras.txt", "images.txt", "points3D.txt", "sparse"}
+    assert {path.name for path in folder.iterdir()} == {
+        "cameras.txt",
+        "images.txt",
+        "points3D.txt",
+        "sparse",
+    }
     ((camera_id, model, width, height, *pinhole),) = rows(folder / "cameras.txt")
     assert (camera_id, model, width, height) == ("1", "PINHOLE", "416", "128")
     fx, fy, cx, cy = map(float, pinhole)
@@ -83,5 +93,7 @@ def test_a_model_reads_back(tmp_path: Path) -> None:
         u, v = fx * seen[:, 0] / seen[:, 2] + cx, fy * seen[:, 1] / seen[:, 2] + cy
         ours = apply(invert(drive()[k]), POINTS) @ CAMERA.K.T
         # their pixel (0.5, 0.5) is our (0, 0)
-        np.testing.assert_allclose(np.stack([u, v], axis=1) - 0.5, ours[:, :2] / ours[:, 2:], atol=1e-2)
+        np.testing.assert_allclose(
+            np.stack([u, v], axis=1) - 0.5, ours[:, :2] / ours[:, 2:], atol=1e-2
+        )
     assert binary_rows(folder / "sparse" / "0") == [lines_of(folder / name) for name in TEXTS]

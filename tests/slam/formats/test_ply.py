@@ -31,7 +31,9 @@ NORMALS = np.tile([0.0, 0.6, 0.8], (2, 1))
 
 
 @pytest.mark.parametrize("triangles", [None, TRIANGLES])
-def test_what_is_written_reads_back_here_and_in_open3d(tmp_path: Path, triangles: np.ndarray | None) -> None:
+def test_what_is_written_reads_back_here_and_in_open3d(
+    tmp_path: Path, triangles: np.ndarray | None
+) -> None:
     path = tmp_path / "c.ply"
     write_ply(path, coloured_ply(POINTS, NORMALS, COLOURS / 255, triangles))
     ply = read_ply(path)
@@ -44,4 +46,6 @@ def test_what_is_written_reads_back_here_and_in_open3d(tmp_path: Path, triangles
         np.testing.assert_array_equal(np.asarray(o3d.io.read_point_cloud(str(path)).points), POINTS)
     else:
         np.testing.assert_array_equal(ply.triangles, triangles)
-        np.testing.assert_array_equal(np.asarray(o3d.io.read_triangle_mesh(str(path)).triangles), triangles)
+        np.testing.assert_array_equal(
+            np.asarray(o3d.io.read_triangle_mesh(str(path)).triangles), triangles
+        )

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from slam.formats.trajectory import Trajectory, associate, matching_tolerance_s, read_trajectory, write_kitti, write_tum
+from slam.formats.trajectory import (
+    Trajectory,
+    associate,
+    matching_tolerance_s,
+    read_trajectory,
+    write_kitti,
+    write_tum,
+)
 from slam.geometry import se3
 from slam.runtime.errors import TrajectoryError
 
@@ -16,7 +23,9 @@ TUM = "0.1 1.5 2.5 3.5 0 0 0 1"
 
 def wander(count: int, period: float = 0.1, seed: int = 0) -> Trajectory:
     rng = np.random.default_rng(seed)
-    T_world_camera = se3.make(Rotation.random(count, rng=rng).as_matrix(), rng.normal(scale=100, size=(count, 3)))
+    T_world_camera = se3.make(
+        Rotation.random(count, rng=rng).as_matrix(), rng.normal(scale=100, size=(count, 3))
+    )
     return Trajectory(period * np.arange(count, dtype=np.float64), T_world_camera)
 
 
@@ -67,9 +76,17 @@ def test_tum_round_trip_keeps_every_digit_of_a_stamp(tmp_path: Path, format: str
         (TUM, "kitti", "line 1: 8 columns where KITTI has 12; this looks like a TUM row"),
         (KITTI, "tum", "line 1: 12 columns where TUM has 8; this looks like a KITTI row"),
         ("1 0 0 0 0 1 0 0 0 0 -1 0", "auto", "line 1: the 3x3 part is not a rotation"),
-        ("1e200 1e200 0 0 -1e200 1e200 0 0 0 0 1 0", "auto", "line 1: the 3x3 part is not a rotation"),
+        (
+            "1e200 1e200 0 0 -1e200 1e200 0 0 0 0 1 0",
+            "auto",
+            "line 1: the 3x3 part is not a rotation",
+        ),
         ("0 0 0 0 0 0 0 0", "auto", "line 1: the quaternion does not have length 1"),
-        (TUM.replace(".", ","), "auto", "line 1: not a number: '0,1'; decimals are written with a point"),
+        (
+            TUM.replace(".", ","),
+            "auto",
+            "line 1: not a number: '0,1'; decimals are written with a point",
+        ),
         (f"{TUM}\n{TUM}\n", "auto", "line 2: time stamps must increase"),
         (
             "".join(f"{k} 0 0 0 0 0 0 1\n" for k in (1, 2, 3, 4, 1, 2, 3, 4)),
@@ -88,11 +105,19 @@ def test_what_is_wrong_is_one_line(tmp_path: Path, text: str, format: str, words
 @pytest.mark.parametrize(
     "bad",
     [
-        *("0.25 1 2", "0.25 1 2 3 nan 0 0 1", "0.25 1 2 3 0 0 0 0", "0.25 1 2 1e13 0 0 0 1", "0.2 1 2 3 0 0 0 1"),
+        *(
+            "0.25 1 2",
+            "0.25 1 2 3 nan 0 0 1",
+            "0.25 1 2 3 0 0 0 0",
+            "0.25 1 2 1e13 0 0 0 1",
+            "0.2 1 2 3 0 0 0 1",
+        ),
         *("0.1 1 2 3 0 0 0 1", "0.25 1 two 3 0 0 0 1", "1 0 0 1.5 0 1 0 2.5 0 0 1 3.5"),
     ],
 )
-def test_a_bad_row_costs_itself_alone(tmp_path: Path, bad: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_bad_row_costs_itself_alone(
+    tmp_path: Path, bad: str, caplog: pytest.LogCaptureFixture
+) -> None:
     rows = [f"{0.1 * k:.1f} {k} 0 0 0 0 0 1" for k in range(6)]
     read = read_trajectory(written(tmp_path, "\n".join([*rows[:3], bad, *rows[3:], "0.9 1"])))
     np.testing.assert_array_equal(read.positions[:, 0], range(6))
@@ -117,7 +142,9 @@ def test_rows_without_stamps_keep_their_places_where_others_are_bad(tmp_path: Pa
 def test_rows_of_whole_matrices(tmp_path: Path, numbered: bool) -> None:
     trajectory = wander(4)
     rows = trajectory.T_world_camera.reshape(4, 16)
-    np.savetxt(tmp_path / "poses.txt", np.column_stack([np.arange(4) * 2, rows]) if numbered else rows)
+    np.savetxt(
+        tmp_path / "poses.txt", np.column_stack([np.arange(4) * 2, rows]) if numbered else rows
+    )
     read = read_trajectory(tmp_path / "poses.txt")
     np.testing.assert_allclose(read.T_world_camera, trajectory.T_world_camera, atol=1e-9)
     np.testing.assert_array_equal(read.frame_numbers, np.arange(4) * (2 if numbered else 1))
@@ -134,7 +161,9 @@ def test_the_true_poses_of_euroc(tmp_path: Path, header: str) -> None:
     ]
 
 
-@pytest.mark.parametrize("row", ["1.0003 0 0 0 0 0.9998 0.0002 0 0 0 1 0", "0 0 0 0 0 0 0.7071 0.7071"])
+@pytest.mark.parametrize(
+    "row", ["1.0003 0 0 0 0 0.9998 0.0002 0 0 0 1 0", "0 0 0 0 0 0 0.7071 0.7071"]
+)
 def test_rounded_rotations_are_repaired(tmp_path: Path, row: str) -> None:
     assert se3.is_se3(read_trajectory(written(tmp_path, row)).T_world_camera, tolerance=1e-12)
 
@@ -175,7 +204,9 @@ def test_frames_cut_the_reference_and_a_file_of_as_many_rows_is_of_these_frames(
 def test_seven_columns_are_a_camera_that_looks_along_x(tmp_path: Path) -> None:
     """TartanVO's: ahead, right and down are x, y and z; a turn to the right is about its z."""
     half = np.sin(np.pi / 4)
-    poses = read_trajectory(written(tmp_path, f"1 2 3 0 0 0 1\n1 2 3 0 0 {half} {half}\n")).T_world_camera
+    poses = read_trajectory(
+        written(tmp_path, f"1 2 3 0 0 0 1\n1 2 3 0 0 {half} {half}\n")
+    ).T_world_camera
     np.testing.assert_allclose(poses[0], se3.make(np.eye(3), np.array([2.0, 3.0, 1.0])), atol=1e-12)
     np.testing.assert_allclose(poses[1, :3, :3] @ [0, 0, 1], [1, 0, 0], atol=1e-12)
 
@@ -190,13 +221,20 @@ def test_stamps_match_one_to_one_within_half_a_period() -> None:
 
 
 @pytest.mark.parametrize("separator", [",", ";", ", ", "\t"])
-@pytest.mark.parametrize(("unit", "form"), [(1, "{:.6f}"), (10**3, "{:.0f}"), (10**6, "{:.0f}"), (10**9, "{:.0f}")])
+@pytest.mark.parametrize(
+    ("unit", "form"), [(1, "{:.6f}"), (10**3, "{:.0f}"), (10**6, "{:.0f}"), (10**9, "{:.0f}")]
+)
 def test_tables_of_others(tmp_path: Path, separator: str, unit: int, form: str) -> None:
     """Another separator, and stamps since 1970 in another unit, rows in no order."""
     stamps = [1403715273.5, 1403715273.25, 1403715274.0, 1403715273.0]
     w_last = unit != 10**9 or separator == "\t"  # separated nanoseconds are EuRoC's, with w x y z
-    rows = [[form.format(t * unit), f"{t - stamps[0]}", "0", "0", *("0001" if w_last else "1000")] for t in stamps]
+    rows = [
+        [form.format(t * unit), f"{t - stamps[0]}", "0", "0", *("0001" if w_last else "1000")]
+        for t in stamps
+    ]
     (tmp_path / "t").write_text("t x y z\n" + "\n".join(separator.join(row) for row in rows))
     found = read_trajectory(tmp_path / "t")
     np.testing.assert_allclose(found.stamps, sorted(stamps), atol=1e-3)
-    np.testing.assert_allclose(found.positions[:, 0], np.array(sorted(stamps)) - stamps[0], atol=1e-6)
+    np.testing.assert_allclose(
+        found.positions[:, 0], np.array(sorted(stamps)) - stamps[0], atol=1e-6
+    )

@@ -29,7 +29,9 @@ SWAPPED = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 def noisy(T: np.ndarray) -> np.ndarray:
     rng = np.random.default_rng(0)
-    return T @ se3.from_rotation_vector(rng.normal(0, 1e-3, (len(T), 3)), rng.normal(0, 0.02, (len(T), 3)))
+    return T @ se3.from_rotation_vector(
+        rng.normal(0, 1e-3, (len(T), 3)), rng.normal(0, 0.02, (len(T), 3))
+    )
 
 
 @pytest.mark.parametrize(
@@ -41,9 +43,13 @@ def noisy(T: np.ndarray) -> np.ndarray:
         (se3.invert, agreement.WRONG),  # the drive backwards
     ],
 )
-def test_lidar_is_compared_with_the_steps_of_the_images(made: Callable[[np.ndarray], np.ndarray], least: float) -> None:
+def test_lidar_is_compared_with_the_steps_of_the_images(
+    made: Callable[[np.ndarray], np.ndarray], least: float
+) -> None:
     motions = {
-        (k, k + 1): Motion(RelativePose(k, k + 1, T, np.full(6, 0.01), "essential"), 1e-4 * np.eye(6))
+        (k, k + 1): Motion(
+            RelativePose(k, k + 1, T, np.full(6, 0.01), "essential"), 1e-4 * np.eye(6)
+        )
         for k, T in enumerate(STEPS)
     }
     path = LidarPath(np.arange(FRAMES + 1), se3.chain(made(STEPS)))
@@ -54,18 +60,32 @@ def test_lidar_is_compared_with_the_steps_of_the_images(made: Callable[[np.ndarr
 
 @pytest.mark.parametrize(
     ("implied", "stated", "is_wrong"),
-    [(1.6, 1.65, False), (1650.0, 1.65, True), (0.0, 1.65, True), (0.0, None, True), (12.0, None, False)],
+    [
+        (1.6, 1.65, False),
+        (1650.0, 1.65, True),
+        (0.0, 1.65, True),
+        (0.0, None, True),
+        (12.0, None, False),
+    ],
 )
-def test_lengths_are_compared_with_the_camera_height(implied: float, stated: float | None, is_wrong: bool) -> None:
+def test_lengths_are_compared_with_the_camera_height(
+    implied: float, stated: float | None, is_wrong: bool
+) -> None:
     found = agreement.of_height("scale.mode=known", implied, stated, 0.02)
     assert found.is_wrong == is_wrong and (is_wrong or found.sigmas < agreement.DOUBTFUL)
 
 
 def test_disparity_that_is_read_as_depth_is_doubtful() -> None:
     true = np.exp(np.random.default_rng(0).uniform(np.log(4), np.log(40), 400))
-    right, inverse = (DepthError().with_step(learned, 1 / true, 0.0 * true, 1.0) for learned in (true, 40 / true))
+    right, inverse = (
+        DepthError().with_step(learned, 1 / true, 0.0 * true, 1.0) for learned in (true, 40 / true)
+    )
     assert agreement.of_depth("png:depth", DepthError()) is None
-    sigmas = [found.sigmas for error in (right, inverse) if (found := agreement.of_depth("png:depth", error))]
+    sigmas = [
+        found.sigmas
+        for error in (right, inverse)
+        if (found := agreement.of_depth("png:depth", error))
+    ]
     assert sigmas[0] < 1 and sigmas[1] > agreement.DOUBTFUL
 
 
@@ -82,7 +102,10 @@ def driven(
     """The confidence of a drive by its images."""
     poses = [RelativePose(k, k + 1, T, np.full(6, 0.01), "essential") for k, T in enumerate(STEPS)]
     drive = Drive(
-        motions=[Motion(pose, 1e-4 * np.eye(6), support=0.1 if k < weak else support) for k, pose in enumerate(poses)],
+        motions=[
+            Motion(pose, 1e-4 * np.eye(6), support=0.1 if k < weak else support)
+            for k, pose in enumerate(poses)
+        ],
         road_steps=dict.fromkeys([pose.ends for pose in poses[:on_road]]),
         roads=[Failed("not asked")] * (FRAMES + 1),
         segments=[Segment(k, k, "another place") for k in range(segments)],
@@ -93,7 +116,9 @@ def driven(
     found = agreement.of_images(drive, camera, ends, needs_road=True)
     steps = STEPS.copy()
     steps[:aside, :3, 3] = [0.9, 0.0, 0.0]
-    sure = agreement.confidence([*found, agreement.of_directions(se3.chain(steps))], is_metric=True, is_carried=False)
+    sure = agreement.confidence(
+        [*found, agreement.of_directions(se3.chain(steps))], is_metric=True, is_carried=False
+    )
     assert isinstance(sure, float)
     return sure
 
@@ -112,7 +137,9 @@ def driven(
     ],
     ids=str,
 )
-def test_a_drive_whose_images_are_unlike_those_of_good_drives_is_doubtful(doubtful: dict[str, Any]) -> None:
+def test_a_drive_whose_images_are_unlike_those_of_good_drives_is_doubtful(
+    doubtful: dict[str, Any],
+) -> None:
     assert driven(**doubtful) < 0.5 < 0.9 < driven(weak=8)
 
 
@@ -133,7 +160,9 @@ def test_a_focal_length_that_nothing_measured_speaks_for_no_camera() -> None:
 
 
 @pytest.mark.parametrize(("is_metric", "is_carried"), [(False, False), (True, True)])
-def test_without_metres_and_of_a_carried_camera_no_number_is_said(is_metric: bool, is_carried: bool) -> None:
+def test_without_metres_and_of_a_carried_camera_no_number_is_said(
+    is_metric: bool, is_carried: bool
+) -> None:
     assert isinstance(agreement.confidence([], is_metric, is_carried), Failed)
 
 
@@ -142,7 +171,10 @@ def test_two_contradictions_are_two_warnings(
 ) -> None:
     monkeypatch.setattr(logging.getLogger(), "handlers", [])
     Terminal(logging.WARNING)
-    for each in (agreement.Agreement("lidar", 3.0, "50 % off"), agreement.Agreement("GPS", 4.0, "far")):
+    for each in (
+        agreement.Agreement("lidar", 3.0, "50 % off"),
+        agreement.Agreement("GPS", 4.0, "far"),
+    ):
         each.said()
     assert "lidar contradicts" in (said := capsys.readouterr().err) and "GPS contradicts" in said
 

@@ -15,7 +15,13 @@ from oracle import snippets_of
 from scipy.spatial.transform import Rotation
 
 from slam.frames import KEYFRAME_SOURCE, Ends, RelativePose, SnippetPoses
-from slam.frontend.completion import INTERPOLATED_SOURCE, find_cuts, find_segments, interpolate_gaps, smooth_rotations
+from slam.frontend.completion import (
+    INTERPOLATED_SOURCE,
+    find_cuts,
+    find_segments,
+    interpolate_gaps,
+    smooth_rotations,
+)
 from slam.frontend.drive import Drive, Segment
 from slam.frontend.factors import chain_raw, join_gap_ends
 from slam.frontend.visual.motion import Motion, RelativeRotation, Steps
@@ -41,7 +47,9 @@ def measured(T_world_camera: FloatArray, first: int, last: int) -> Motion:
 
 def closed(T_world_camera: FloatArray, unusable: set[int], *steps: Motion) -> Drive:
     reasons = dict.fromkeys(unusable, "black")
-    return interpolate_gaps(collected(snippets_of(T_world_camera, unusable=unusable), steps, unusable=reasons), 4)
+    return interpolate_gaps(
+        collected(snippets_of(T_world_camera, unusable=unusable), steps, unusable=reasons), 4
+    )
 
 
 def collected(snippets: list[SnippetPoses], steps: Iterable[Motion] = (), **others: Any) -> Drive:
@@ -56,7 +64,9 @@ def test_a_drive_without_gaps_stays_as_it_was() -> None:
     assert found.gap_steps == [] and found.interpolated == {}
 
 
-@pytest.mark.parametrize("gap", [{20}, set(range(15, 25)), {0}, {39}, {3, 20, 21}, {10, 12, 14, 16}])
+@pytest.mark.parametrize(
+    "gap", [{20}, set(range(15, 25)), {0}, {39}, {3, 20, 21}, {10, 12, 14, 16}]
+)
 def test_a_gap_of_a_steady_drive_is_interpolated_exactly(gap: set[int]) -> None:
     found = closed(steady(), gap)
     assert set(found.interpolated) == gap and found.interpolated[min(gap)] == "black"
@@ -78,7 +88,10 @@ def test_a_gap_beside_steps_of_the_network_alone_has_the_unit_of_learned_depth()
     steps = [measured(steady(), k, k + 1) for k in (*range(14), *range(26, COUNT - 1))]
     unusable = set(range(17, 23))
     found = interpolate_gaps(
-        collected(snippets_of(short, unusable=unusable), steps, unusable=dict.fromkeys(unusable, "black")), 4
+        collected(
+            snippets_of(short, unusable=unusable), steps, unusable=dict.fromkeys(unusable, "black")
+        ),
+        4,
     )
     for factor in found.gap_steps:
         np.testing.assert_allclose(factor.T_from_to, STEP, atol=1e-9)
@@ -87,7 +100,11 @@ def test_a_gap_beside_steps_of_the_network_alone_has_the_unit_of_learned_depth()
 
 def test_the_motion_changes_evenly_from_before_to_after() -> None:
     lengths = np.r_[np.full(19, 1.0), np.full(20, 3.0)]
-    drive = chain(from_rotation_vector(np.zeros((39, 3)), np.stack([0 * lengths, 0 * lengths, lengths], axis=1)))
+    drive = chain(
+        from_rotation_vector(
+            np.zeros((39, 3)), np.stack([0 * lengths, 0 * lengths, lengths], axis=1)
+        )
+    )
     steps = {f.from_index: f.T_from_to[2, 3] for f in closed(drive, set(range(15, 25))).gap_steps}
     values = [steps[k] for k in range(14, 25)]
     assert values == sorted(values) and 1.0 < values[0] < 1.5 and 2.5 < values[-1] < 3.0
@@ -95,11 +112,17 @@ def test_the_motion_changes_evenly_from_before_to_after() -> None:
 
 def test_a_step_over_a_gap_is_divided_into_equal_ones() -> None:
     drive = steady()
-    drive[25:] = drive[14] @ from_rotation_vector(np.array([0.0, 0.4, 0.0]), np.array([1.0, 0.0, 5.0])) @ drive[:15]
+    drive[25:] = (
+        drive[14]
+        @ from_rotation_vector(np.array([0.0, 0.4, 0.0]), np.array([1.0, 0.0, 5.0]))
+        @ drive[:15]
+    )
     over_gap = measured(drive, 14, 25)
     found = closed(drive, set(range(15, 25)), over_gap)
     inside = [f.T_from_to for f in found.gap_steps if 14 <= f.from_index < 25]
-    np.testing.assert_allclose(chain(np.array(inside))[-1], over_gap.relative_pose.T_from_to, atol=1e-9)
+    np.testing.assert_allclose(
+        chain(np.array(inside))[-1], over_gap.relative_pose.T_from_to, atol=1e-9
+    )
     assert found.steps[14, 25] is over_gap
 
 
@@ -119,7 +142,12 @@ def test_a_step_that_skips_usable_frames_does_not_change_the_interpolation() -> 
 
 
 def drifting() -> FloatArray:
-    return chain(np.tile(from_rotation_vector(np.array([0.0, 0.1, 0.0]), np.array([0.0, 0.0, 2.0])), (COUNT - 1, 1, 1)))
+    return chain(
+        np.tile(
+            from_rotation_vector(np.array([0.0, 0.1, 0.0]), np.array([0.0, 0.0, 2.0])),
+            (COUNT - 1, 1, 1),
+        )
+    )
 
 
 def repeating(frozen: bool) -> tuple[Drive, FloatArray]:
@@ -131,14 +159,20 @@ def repeating(frozen: bool) -> tuple[Drive, FloatArray]:
     seen = true.copy()
     seen[15:25] = seen[14]
     steps = [measured(seen, k, k + 1) for k in range(COUNT - 1)]
-    return interpolate_gaps(collected(snippets_of(seen), steps, repeated=list(range(15, 25))), 4), true
+    return interpolate_gaps(
+        collected(snippets_of(seen), steps, repeated=list(range(15, 25))), 4
+    ), true
 
 
 def test_repeated_images_of_a_moving_camera_are_interpolated() -> None:
     found, true = repeating(frozen=True)
-    assert set(found.interpolated) == set(range(15, 25)) and "stands still" in found.interpolated[15]
+    assert (
+        set(found.interpolated) == set(range(15, 25)) and "stands still" in found.interpolated[15]
+    )
     assert [f.from_index for f in found.gap_steps] == list(range(14, 25))
-    np.testing.assert_allclose(chain(np.array([f.T_from_to for f in found.gap_steps])), true[:12], atol=1e-9)
+    np.testing.assert_allclose(
+        chain(np.array([f.T_from_to for f in found.gap_steps])), true[:12], atol=1e-9
+    )
     assert [ends for ends in found.steps if ends[1] - ends[0] > 1] == [(14, 25)]
     assert not any(set(range(15, 25)).intersection(ends) for ends in found.steps)
 
@@ -157,11 +191,15 @@ def test_repetition_to_the_end_is_standing_still() -> None:
 
 def test_without_any_snippet_there_is_one_error() -> None:
     reasons = dict.fromkeys(range(3, COUNT, 4), "image 3 is truncated")
-    with pytest.raises(SlamError, match="no 5 usable frames in a row among 40: image 3 is truncated"):
+    with pytest.raises(
+        SlamError, match="no 5 usable frames in a row among 40: image 3 is truncated"
+    ):
         interpolate_gaps(collected([], unusable=reasons), 4)
 
 
-def relative(T_world_camera: FloatArray, first: int, last: int, sigma: float, source: str) -> RelativePose:
+def relative(
+    T_world_camera: FloatArray, first: int, last: int, sigma: float, source: str
+) -> RelativePose:
     T = invert(T_world_camera[first]) @ T_world_camera[last]
     return RelativePose(first, last, T, np.full(6, sigma), source)
 
@@ -175,7 +213,10 @@ def test_a_long_gap_ends_where_the_map_says() -> None:
     step = from_rotation_vector(np.zeros(3), np.array([0.01, 0.0, 0.0]))
     mapped = [*range(before), *range(after + 1, count)]
     by_map = [relative(truth, a, b, 0.01, KEYFRAME_SOURCE) for a, b in pairwise(mapped)]
-    guesses = [RelativePose(k, k + 1, step, np.full(6, 0.005), INTERPOLATED_SOURCE) for k in range(before - 1, after)]
+    guesses = [
+        RelativePose(k, k + 1, step, np.full(6, 0.005), INTERPOLATED_SOURCE)
+        for k in range(before - 1, after)
+    ]
     measured = [relative(truth, after, after + 1, 0.01, "essential")]
     found = join_gap_ends(guesses, measured, by_map, dict.fromkeys(mapped, 0))
     assert [pose.ends for pose in found] == [pose.ends for pose in guesses]
@@ -190,7 +231,10 @@ def test_a_long_gap_ends_where_the_map_says() -> None:
 def test_a_gap_between_two_maps_stays_a_guess() -> None:
     guess = RelativePose(1, 2, np.eye(4), np.ones(6), INTERPOLATED_SOURCE)
     truth = from_rotation_vector(np.zeros((4, 3)), np.arange(12.0).reshape(4, 3))
-    by_map = [relative(truth, 0, 1, 0.01, KEYFRAME_SOURCE), relative(truth, 2, 3, 0.01, KEYFRAME_SOURCE)]
+    by_map = [
+        relative(truth, 0, 1, 0.01, KEYFRAME_SOURCE),
+        relative(truth, 2, 3, 0.01, KEYFRAME_SOURCE),
+    ]
     (found,) = join_gap_ends([guess], [], by_map, {0: 0, 1: 0, 2: 1, 3: 1})
     assert found is guess
 
@@ -201,7 +245,9 @@ STEPS = [(k, k + 1) for k in range(9)]
 def test_a_single_failed_step_between_measured_ones_is_a_cut() -> None:
     measured = [ends for ends in STEPS if ends != (4, 5)]
     assert find_cuts([(4, 5, "no corners")], measured, ()) == [5]
-    assert find_cuts([(4, 5, "no corners")], [*measured, (3, 5)], ()) == [], "a longer step measures across it"
+    assert find_cuts([(4, 5, "no corners")], [*measured, (3, 5)], ()) == [], (
+        "a longer step measures across it"
+    )
     assert find_cuts([(4, 5, "no corners")], measured, {5}) == [], "the image is unusable"
     two = [ends for ends in measured if ends != (5, 6)]
     assert find_cuts([(4, 5, ""), (5, 6, "")], two, ()) == [], "one bad image fails two steps"
@@ -233,7 +279,8 @@ def small(rng: np.random.Generator, sigma: float) -> FloatArray:
 def true_rotations(rng: np.random.Generator) -> list[FloatArray]:
     """``R_current_previous`` of a drive that turns by up to 4 degrees a step."""
     return [
-        Rotation.from_euler("y", 4.0 * np.sin(0.3 * k), degrees=True).as_matrix() @ small(rng, 0.005)
+        Rotation.from_euler("y", 4.0 * np.sin(0.3 * k), degrees=True).as_matrix()
+        @ small(rng, 0.005)
         for k in range(ROTATIONS)
     ]
 
@@ -244,7 +291,10 @@ def table_of(rotations: Mapping[Ends, FloatArray], correlation: float = 0.0) -> 
     covariance = SIGMA**2 * np.diag([1.0, 1.0, 1.0, 4.0, 4.0, 4.0])
     covariance[1, 3] = covariance[3, 1] = 2.0 * correlation * SIGMA**2
     return {
-        ends: Motion(RelativePose(*ends, invert(make(R, T_CURRENT_PREVIOUS)), sigmas, "essential"), covariance)
+        ends: Motion(
+            RelativePose(*ends, invert(make(R, T_CURRENT_PREVIOUS)), sigmas, "essential"),
+            covariance,
+        )
         for ends, R in rotations.items()
     }
 
@@ -254,7 +304,9 @@ def single(rotations: list[FloatArray]) -> Steps:
 
 
 def rotations_of(table: Steps) -> dict[Ends, FloatArray]:
-    return {motion.ends: invert(motion.relative_pose.T_from_to)[:3, :3] for motion in table.values()}
+    return {
+        motion.ends: invert(motion.relative_pose.T_from_to)[:3, :3] for motion in table.values()
+    }
 
 
 def error_deg(table: Steps, truth: list[FloatArray]) -> float:
@@ -274,7 +326,9 @@ def drive(
     sigmas = np.full(3, SIGMA)
     steps = single([off @ small(rng, 0.1 * SIGMA) @ R for R in truth])
     across = [
-        RelativeRotation((k, k + 2), off @ small(rng, baseline_noise) @ truth[k + 1] @ truth[k], sigmas)
+        RelativeRotation(
+            (k, k + 2), off @ small(rng, baseline_noise) @ truth[k + 1] @ truth[k], sigmas
+        )
         for k in range(ROTATIONS - 1)
     ]
     return steps, across, truth
@@ -310,7 +364,9 @@ def test_directions_follow_rotations_as_far_as_they_are_correlated() -> None:
         steps = table_of(rotations_of(biased), correlation)
         smoothed = smooth_rotations(steps, across)
         for before, after in zip(steps.values(), smoothed.values(), strict=True):
-            R, R_before = (invert(motion.relative_pose.T_from_to)[:3, :3] for motion in (after, before))
+            R, R_before = (
+                invert(motion.relative_pose.T_from_to)[:3, :3] for motion in (after, before)
+            )
             turned = Rotation.from_matrix(R @ R_before.T).as_rotvec()[1]
             seen = invert(after.relative_pose.T_from_to)[:3, 3]
             assert np.abs(turned) > 0.1 * SIGMA
@@ -326,9 +382,12 @@ def test_steps_that_skip_frames_are_smoothed_like_others() -> None:
     expected = rotations_of(smooth_rotations(steps, across))
     sparse = table_of({(3 * k, 3 * k + 3): R for (k, _), R in rotations_of(steps).items()})
     sparse_across = [
-        RelativeRotation((3 * each.ends[0], 3 * each.ends[1]), each.R_to_from, each.sigmas) for each in across
+        RelativeRotation((3 * each.ends[0], 3 * each.ends[1]), each.R_to_from, each.sigmas)
+        for each in across
     ]
     for (first, _), R in rotations_of(smooth_rotations(sparse, sparse_across)).items():
         np.testing.assert_allclose(R, expected[first // 3, first // 3 + 1], atol=1e-12)
-    ends_inside = [RelativeRotation((k, k + 4), truth[0], np.full(3, SIGMA)) for k in range(0, 60, 3)]
+    ends_inside = [
+        RelativeRotation((k, k + 4), truth[0], np.full(3, SIGMA)) for k in range(0, 60, 3)
+    ]
     assert smooth_rotations(sparse, ends_inside) is sparse

@@ -36,7 +36,10 @@ METRES = 4.0  # per unscaled length
 COUNT = 300
 UNIT = 0.75  # of learned depth per unit of the network
 UNIT_METRES = 1.6  # per unit of learned depth
-ROTATION, TRANSLATION = np.deg2rad(0.1), 0.08  # sigmas of a step of the network, the latter over its length
+ROTATION, TRANSLATION = (
+    np.deg2rad(0.1),
+    0.08,
+)  # sigmas of a step of the network, the latter over its length
 DEPTH_UNIT = np.full(COUNT, UNIT_METRES)
 
 
@@ -59,10 +62,14 @@ def motions(steps: list[Ends], T: FloatArray) -> list[Motion]:
 
 def scale(lengths: Mapping[Ends, float] | None = None) -> Scale:
     known = {ends: StepLength(value, 0.02, 0.03) for ends, value in (lengths or {}).items()}
-    return Scale("camera-height", Failed("drawn"), np.full(FRAMES, METRES), known, "the networks' own unit")
+    return Scale(
+        "camera-height", Failed("drawn"), np.full(FRAMES, METRES), known, "the networks' own unit"
+    )
 
 
-def factors(measured: Drive, scale: Scale, lidar: tuple[RelativePose, ...] = ()) -> list[RelativePose]:
+def factors(
+    measured: Drive, scale: Scale, lidar: tuple[RelativePose, ...] = ()
+) -> list[RelativePose]:
     return make_factors(measured, scale, lidar)
 
 
@@ -74,11 +81,20 @@ def test_every_measurement_becomes_a_factor_in_the_unit_of_the_scale() -> None:
     interpolated = [pose(7, 8, "interpolated", small)]
     lidar = (pose(3, 4, "lidar"),)  # in metres already
     found = factors(
-        Drive(motions=motions(STEPS, small), trusted=snippets_of(small), gap_steps=interpolated), scale(), lidar
+        Drive(motions=motions(STEPS, small), trusted=snippets_of(small), gap_steps=interpolated),
+        scale(),
+        lidar,
     )
-    assert {factor.source for factor in found} == {"essential", "interpolated", "lidar", NETWORK_SOURCE}
+    assert {factor.source for factor in found} == {
+        "essential",
+        "interpolated",
+        "lidar",
+        NETWORK_SOURCE,
+    }
     for factor in found:
-        np.testing.assert_allclose(factor.T_from_to, invert(TRUE[factor.from_index]) @ TRUE[factor.to_index], atol=1e-9)
+        np.testing.assert_allclose(
+            factor.T_from_to, invert(TRUE[factor.from_index]) @ TRUE[factor.to_index], atol=1e-9
+        )
     assert [factor.ends for factor in found if factor.source == "essential"] == STEPS
     sigmas = {factor.source: factor.sigmas for factor in found}
     np.testing.assert_allclose(sigmas["interpolated"][3:], METRES * 0.01)
@@ -88,7 +104,9 @@ def test_every_measurement_becomes_a_factor_in_the_unit_of_the_scale() -> None:
 def test_a_step_takes_its_own_length_also_where_it_skips_frames() -> None:
     """Learned depth makes every step three times too long; a step of one frame and one of three have own lengths."""
     wrong = drive(3.0 / METRES)
-    lengths = {ends: float(np.linalg.norm(pose(*ends).T_from_to[:3, 3])) for ends in ((0, 1), (2, 5))}
+    lengths = {
+        ends: float(np.linalg.norm(pose(*ends).T_from_to[:3, 3])) for ends in ((0, 1), (2, 5))
+    }
     found = {f.ends: f for f in factors(Drive(motions=motions(STEPS, wrong)), scale(lengths))}
     for ends in lengths:
         np.testing.assert_allclose(found[ends].T_from_to, pose(*ends).T_from_to, atol=1e-9)
@@ -96,19 +114,28 @@ def test_a_step_takes_its_own_length_also_where_it_skips_frames() -> None:
         assert found[ends].correlated_sigmas is not None
         assert found[ends].sigmas[5] == pytest.approx(0.02 * lengths[ends], rel=0.05)
         assert found[ends].graph_sigmas[5] == pytest.approx(0.03 * lengths[ends], rel=0.05)
-    np.testing.assert_allclose(found[1, 2].T_from_to[2, 3], 3.0 * pose(1, 2).T_from_to[2, 3], rtol=1e-9)
+    np.testing.assert_allclose(
+        found[1, 2].T_from_to[2, 3], 3.0 * pose(1, 2).T_from_to[2, 3], rtol=1e-9
+    )
     assert found[1, 2].student_t_dof == np.inf
 
 
-def test_the_network_has_a_factor_on_every_step_that_nothing_else_measures_where_its_unit_is_not_known() -> None:
+def test_the_network_has_a_factor_on_every_step_that_nothing_else_measures_where_its_unit_is_not_known() -> (
+    None
+):
     found = factors(Drive(motions=motions(STEPS, TRUE), trusted=snippets_of(TRUE)), scale())
     every = [(k, k + 1) for k in range(FRAMES - 1)]
-    assert [f.ends for f in found if f.source == NETWORK_SOURCE] == [ends for ends in every if ends not in STEPS]
+    assert [f.ends for f in found if f.source == NETWORK_SOURCE] == [
+        ends for ends in every if ends not in STEPS
+    ]
 
 
 def by_network() -> list[RelativePose]:
     """With the opposite rotation, so that its steps can be recognised."""
-    return [RelativePose(k, k + 1, T_OF_NETWORK, np.full(6, 0.1), NETWORK_SOURCE) for k in range(FRAMES - 1)]
+    return [
+        RelativePose(k, k + 1, T_OF_NETWORK, np.full(6, 0.1), NETWORK_SOURCE)
+        for k in range(FRAMES - 1)
+    ]
 
 
 T_OF_NETWORK = from_rotation_vector(np.array([0.0, -0.1, 0.0]), np.array([0.0, 0.0, 0.5 * METRES]))
@@ -134,8 +161,12 @@ def test_odometry_takes_the_step_from_the_nearest_frame_and_the_last_of_these() 
 
 def network_drive(count: int) -> np.ndarray:
     rng = np.random.default_rng(0)
-    turns = np.stack([0.01 * rng.normal(size=count), 0.1 * rng.normal(size=count), 0 * np.arange(count)], axis=1)
-    steps = np.stack([0 * np.arange(count), 0 * np.arange(count), 1 + 0.2 * rng.normal(size=count)], axis=1)
+    turns = np.stack(
+        [0.01 * rng.normal(size=count), 0.1 * rng.normal(size=count), 0 * np.arange(count)], axis=1
+    )
+    steps = np.stack(
+        [0 * np.arange(count), 0 * np.arange(count), 1 + 0.2 * rng.normal(size=count)], axis=1
+    )
     return se3.chain(se3.from_rotation_vector(turns[1:], steps[1:]))
 
 
@@ -157,10 +188,18 @@ def test_chain_uses_target_to_next_and_nothing_else():
     np.testing.assert_allclose(inner, se3.invert(T[2:-2]) @ T[3:-1], atol=1e-9)
     # the ends come from the direct poses, which are wrong here
     first, last = snippets[0], snippets[-1]
-    np.testing.assert_allclose(se3.invert(chained[0]) @ chained[2], first.T_source_target[0], atol=1e-9)
-    np.testing.assert_allclose(se3.invert(chained[1]) @ chained[2], first.T_source_target[1], atol=1e-9)
-    np.testing.assert_allclose(se3.invert(chained[11]) @ chained[9], last.T_source_target[3], atol=1e-9)
-    np.testing.assert_allclose(se3.invert(chained[10]) @ chained[9], last.T_source_target[2], atol=1e-9)
+    np.testing.assert_allclose(
+        se3.invert(chained[0]) @ chained[2], first.T_source_target[0], atol=1e-9
+    )
+    np.testing.assert_allclose(
+        se3.invert(chained[1]) @ chained[2], first.T_source_target[1], atol=1e-9
+    )
+    np.testing.assert_allclose(
+        se3.invert(chained[11]) @ chained[9], last.T_source_target[3], atol=1e-9
+    )
+    np.testing.assert_allclose(
+        se3.invert(chained[10]) @ chained[9], last.T_source_target[2], atol=1e-9
+    )
 
 
 def test_a_step_that_several_snippets_see_is_their_mean():
@@ -177,7 +216,9 @@ def test_a_step_that_several_snippets_see_is_their_mean():
     assert mean < 0.6 * single
 
 
-def seen_by_network(T: FloatArray, unit: FloatArray | float = UNIT, seed: int = 0) -> dict[int, FloatArray]:
+def seen_by_network(
+    T: FloatArray, unit: FloatArray | float = UNIT, seed: int = 0
+) -> dict[int, FloatArray]:
     """Steps in a unit ``(N - 1,)`` of their own, with noise in proportion to the usual length."""
     rng, count = np.random.default_rng(seed), len(T) - 1
     steps = se3.invert(T[:-1]) @ T[1:]
@@ -227,7 +268,11 @@ def test_a_third_of_wrong_steps_does_not_change_the_unit() -> None:
 def test_with_few_measured_steps_lengths_are_those_of_learned_depth_and_uncertain() -> None:
     T = network_drive(COUNT)
     steps = seen_by_network(T)
-    for geometric in ([], measured(T, range(100, 119)), measured(np.tile(np.eye(4), (COUNT, 1, 1)))):
+    for geometric in (
+        [],
+        measured(T, range(100, 119)),
+        measured(np.tile(np.eye(4), (COUNT, 1, 1))),
+    ):
         found = calibrate_network(steps, geometric, DEPTH_UNIT)
         np.testing.assert_array_equal(found.unit, DEPTH_UNIT)
         factor = network_factors(steps, found)[50]

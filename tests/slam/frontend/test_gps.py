@@ -29,8 +29,16 @@ def scale(positions: FloatArray, seed: int) -> ScaleEstimate | Failed:
     kept = np.exp(-1.0 / CONFIG.correlation_s)
     for k in range(1, len(errors)):
         errors[k] = kept * errors[k - 1] + np.sqrt(1.0 - kept**2) * errors[k]
-    enu = np.column_stack([np.interp(seconds, stamps, positions[:, k]) for k in (0, 2, 1)]) * [1.0, 1.0, -1.0]
-    track = GpsTrack(seconds, LocalFrame(np.array([48.0, 11.0, 500.0])).places(enu + errors), np.ones(len(seconds)))
+    enu = np.column_stack([np.interp(seconds, stamps, positions[:, k]) for k in (0, 2, 1)]) * [
+        1.0,
+        1.0,
+        -1.0,
+    ]
+    track = GpsTrack(
+        seconds,
+        LocalFrame(np.array([48.0, 11.0, 500.0])).places(enu + errors),
+        np.ones(len(seconds)),
+    )
     T_world_camera = np.tile(np.eye(4), (len(positions), 1, 1))
     T_world_camera[:, :3, 3] = positions
     return GpsFixes(track, stamps, CONFIG, "gps").scale(T_world_camera)
@@ -74,6 +82,12 @@ def test_a_minute_of_arc_has_its_length() -> None:
     """At the equator a minute of longitude is a/3437.7 long; at the pole a minute of latitude a^2/b/3437.7."""
     minute = np.deg2rad(1 / 60)
     east = LocalFrame(np.array([0.0, 0.0, 0.0])).points(np.array([[0.0, 1 / 60, 0.0]]))[0]
-    assert east[0] == pytest.approx(6378137.0 * minute, abs=1e-3) and east[1] == pytest.approx(0.0, abs=1e-9)
-    north = LocalFrame(np.array([90.0, 0.0, 0.0])).points(np.array([[90.0 - 1 / 60, 180.0, 0.0]]))[0]
-    assert np.hypot(north[0], north[1]) == pytest.approx(6378137.0**2 / 6356752.314245179 * minute, abs=1e-2)
+    assert east[0] == pytest.approx(6378137.0 * minute, abs=1e-3) and east[1] == pytest.approx(
+        0.0, abs=1e-9
+    )
+    north = LocalFrame(np.array([90.0, 0.0, 0.0])).points(np.array([[90.0 - 1 / 60, 180.0, 0.0]]))[
+        0
+    ]
+    assert np.hypot(north[0], north[1]) == pytest.approx(
+        6378137.0**2 / 6356752.314245179 * minute, abs=1e-2
+    )

@@ -18,7 +18,10 @@ QUALITIES = range(60, 90, 3)
 STREET = 24  # frames
 HAZARDS = [
     (),
-    *(pytest.param(each, marks=pytest.mark.slow) for each in (("exposure", "blur"), ("rain", "moving-cars"))),
+    *(
+        pytest.param(each, marks=pytest.mark.slow)
+        for each in (("exposure", "blur"), ("rain", "moving-cars"))
+    ),
 ]
 
 
@@ -51,8 +54,13 @@ def jpeg(image: Image, quality: int) -> Image:
 def wide() -> Image:
     """A wide image with structures of all sizes."""
     rng = np.random.default_rng(0)
-    layers = [cv2.GaussianBlur(rng.normal(size=(64, 700)), (0, 0), sigma) for sigma in (1.0, 3.0, 20.0)]
-    grey = 128.0 + sum(weight * layer / layer.std() for weight, layer in zip((15.0, 15.0, 40.0), layers, strict=True))
+    layers = [
+        cv2.GaussianBlur(rng.normal(size=(64, 700)), (0, 0), sigma) for sigma in (1.0, 3.0, 20.0)
+    ]
+    grey = 128.0 + sum(
+        weight * layer / layer.std()
+        for weight, layer in zip((15.0, 15.0, 40.0), layers, strict=True)
+    )
     return np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
 
 
@@ -69,7 +77,10 @@ def test_a_drive_passes(hazards: tuple[str, ...]) -> None:
 
 @pytest.mark.parametrize("level", [0, 255, 90])
 def test_blank_images_with_a_little_noise_are_refused_and_the_drive_goes_on(level: int) -> None:
-    dark = [np.clip(level + np.random.default_rng(k).normal(0, 1.5, (64, 208, 3)), 0, 255) for k in range(3)]
+    dark = [
+        np.clip(level + np.random.default_rng(k).normal(0, 1.5, (64, 208, 3)), 0, 255)
+        for k in range(3)
+    ]
     found = verdicts([*street()[:3], *(image.astype(np.uint8) for image in dark), *street()[20:23]])
     assert found == ["new"] * 3 + ["the image is blank"] * 3 + ["new"] * 3
 
@@ -89,14 +100,21 @@ def test_an_image_of_the_same_bytes_is_a_repetition() -> None:
     first, second = street()[:2]
     almost = second.copy()
     almost[0, 0, 0] ^= 1
-    assert verdicts([first, second, second.copy(), second]) == ["new", "new", "repeated", "repeated"]
+    assert verdicts([first, second, second.copy(), second]) == [
+        "new",
+        "new",
+        "repeated",
+        "repeated",
+    ]
     assert verdicts([first, almost, second]) == ["new", "new", "repeated"]  # a bit is no motion
     assert verdicts([second, almost]) == ["new", "new"]  # the camera has not moved yet
 
 
 @pytest.mark.parametrize("hazards", HAZARDS)
 @pytest.mark.parametrize("first", [3, 9])
-def test_ten_re_encoded_copies_are_repetitions_and_the_drive_goes_on(hazards: tuple[str, ...], first: int) -> None:
+def test_ten_re_encoded_copies_are_repetitions_and_the_drive_goes_on(
+    hazards: tuple[str, ...], first: int
+) -> None:
     images = street(hazards)
     copies = [jpeg(images[first], quality) for quality in QUALITIES]
     assert len(copies) == 10 and not any(np.array_equal(copy, images[first]) for copy in copies)
@@ -107,7 +125,9 @@ def test_ten_re_encoded_copies_are_repetitions_and_the_drive_goes_on(hazards: tu
 def test_copies_are_detected_where_every_image_is_compressed() -> None:
     images = [jpeg(image, 75) for image in street()]
     frozen = [jpeg(street()[9], quality) for quality in QUALITIES]
-    assert verdicts([*images[:10], *frozen, *images[20:]]) == ["new"] * 10 + ["repeated"] * 10 + ["new"] * (STREET - 20)
+    assert verdicts([*images[:10], *frozen, *images[20:]]) == ["new"] * 10 + ["repeated"] * 10 + [
+        "new"
+    ] * (STREET - 20)
     assert set(verdicts(images)) == {"new"}
 
 
@@ -115,16 +135,24 @@ def test_a_freeze_of_a_slow_camera_is_detected() -> None:
     """At two pixels a frame; the drive goes on where the camera is by then."""
     images = panned(2.0 * np.arange(40))
     frozen = [jpeg(images[9], quality) for quality in QUALITIES]
-    assert verdicts([*images[:10], *frozen, *images[20:]]) == ["new"] * 10 + ["repeated"] * 10 + ["new"] * 20
+    assert (
+        verdicts([*images[:10], *frozen, *images[20:]])
+        == ["new"] * 10 + ["repeated"] * 10 + ["new"] * 20
+    )
 
 
 @pytest.mark.parametrize("braking_px", [0.2, 0.4])
 def test_a_camera_that_slows_down_and_stops_is_not_frozen(braking_px: float) -> None:
     """Every frame is compressed separately, so that no two images of the standing camera have the same bytes."""
-    speeds = np.concatenate([np.full(8, 4.0), np.arange(4.0, 0.0, -braking_px), np.zeros(12), np.arange(0.0, 4.0, 0.5)])
+    speeds = np.concatenate(
+        [np.full(8, 4.0), np.arange(4.0, 0.0, -braking_px), np.zeros(12), np.arange(0.0, 4.0, 0.5)]
+    )
     images = panned(np.cumsum(speeds))
     rng = np.random.default_rng(0)
-    noisy = [np.clip(image + rng.normal(0.0, 1.5, image.shape), 0, 255).astype(np.uint8) for image in images]
+    noisy = [
+        np.clip(image + rng.normal(0.0, 1.5, image.shape), 0, 255).astype(np.uint8)
+        for image in images
+    ]
     assert set(verdicts([jpeg(image, 60 + k % 28) for k, image in enumerate(noisy)])) == {"new"}
 
 

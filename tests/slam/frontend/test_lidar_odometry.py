@@ -55,7 +55,10 @@ def test_steps_are_those_between_neighbouring_scanned_frames():
     T_world_camera = np.tile(np.eye(4), (4, 1, 1))
     T_world_camera[:, 2, 3] = [0.0, 1.0, 4.0, 5.5]
     steps = lidar_steps(LidarPath(np.array([3, 4, 7, 8]), T_world_camera))
-    assert [(s.from_index, s.to_index, s.source) for s in steps] == [(3, 4, "lidar"), (7, 8, "lidar")]
+    assert [(s.from_index, s.to_index, s.source) for s in steps] == [
+        (3, 4, "lidar"),
+        (7, 8, "lidar"),
+    ]
     assert [s.T_from_to[2, 3] for s in steps] == [1.0, 1.5]
     np.testing.assert_array_equal(steps[0].sigmas[3:], 0.03)
 
@@ -77,7 +80,9 @@ def test_scans_that_cannot_be_read_are_left_out_with_one_warning(street, tmp_pat
     assert isinstance(path, LidarPath)
     np.testing.assert_array_equal(path.frames, [0, 2, 3])
     assert "1.bin is no Velodyne scan" in path.unreadable[1] and list(path.unreadable) == [1]
-    assert caplog.messages == [f"1 of 4 LiDAR scans cannot be read, first {path.unreadable[1]}: they are left out"]
+    assert caplog.messages == [
+        f"1 of 4 LiDAR scans cannot be read, first {path.unreadable[1]}: they are left out"
+    ]
     assert path.T_world_camera[-1, 2, 3] == pytest.approx(street.T_world_camera[3, 2, 3], abs=0.5)
 
 
@@ -87,7 +92,9 @@ def test_without_two_scans_that_can_be_read_the_reason_stands_for_the_path(stree
         path.write_bytes(b"12345")
     failure = lidar_path(sequence)
     assert isinstance(failure, Failed)
-    assert re.search(r"2 of 2 LiDAR scans .*0\.bin is no Velodyne scan.*; got [45] bytes", failure.reason)
+    assert re.search(
+        r"2 of 2 LiDAR scans .*0\.bin is no Velodyne scan.*; got [45] bytes", failure.reason
+    )
 
 
 @pytest.mark.slow

@@ -35,12 +35,16 @@ HEIGHT = 0.37
 @pytest.fixture(scope="module")
 def texture() -> np.ndarray:
     rng = np.random.default_rng(0)
-    layers = [gaussian_filter(rng.normal(size=(1024, 1024)), sigma, mode="wrap") for sigma in (2, 6)]
+    layers = [
+        gaussian_filter(rng.normal(size=(1024, 1024)), sigma, mode="wrap") for sigma in (2, 6)
+    ]
     noise = sum(layer / layer.std() for layer in layers)
     return np.clip(120 + 10 * noise, 0, 255).astype(np.float32)
 
 
-def render(T_road_camera: np.ndarray, texture: np.ndarray, index: int, car_ahead: bool = False) -> Frame:
+def render(
+    T_road_camera: np.ndarray, texture: np.ndarray, index: int, car_ahead: bool = False
+) -> Frame:
     """A road ``HEIGHT_M`` below the road frame's origin under an even sky."""
     rays = RAYS @ T_road_camera[:3, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -51,7 +55,9 @@ def render(T_road_camera: np.ndarray, texture: np.ndarray, index: int, car_ahead
     grey = np.where(ground, cv2.remap(texture, a % 1023, b % 1023, cv2.INTER_LINEAR), 200.0)
     if car_ahead:
         grey[100:140, 270:340] = 90.0  # it drives as fast as the camera
-    return Frame(index, 0.1 * index, np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, axis=2))
+    return Frame(
+        index, 0.1 * index, np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+    )
 
 
 def behind_a_car(texture: np.ndarray, rows: int) -> list[Frame]:
@@ -67,7 +73,9 @@ def pitched(pitch_deg: float) -> np.ndarray:
     return se3.from_rotation_vector(np.deg2rad([pitch_deg, 0.0, 0.0]), np.zeros(3))
 
 
-def measure(texture, step: np.ndarray, pitch_deg: float = 0.0, car_ahead=False) -> RoadStep | Failed:
+def measure(
+    texture, step: np.ndarray, pitch_deg: float = 0.0, car_ahead=False
+) -> RoadStep | Failed:
     """One step of a camera that looks down by ``pitch_deg``; only the direction of its motion is given."""
     T_body_camera = pitched(-pitch_deg)
     previous = render(T_body_camera, texture, 0, car_ahead)
@@ -80,7 +88,9 @@ def measure(texture, step: np.ndarray, pitch_deg: float = 0.0, car_ahead=False) 
 @pytest.mark.parametrize("length_m", [0.15, 0.6, 1.3, 2.4])
 @pytest.mark.parametrize(("turn_deg", "pitch_deg"), [(0.0, 0.0), (3.0, 0.0), (0.0, 3.0)])
 def test_length_is_measured_in_camera_heights(texture, length_m, turn_deg, pitch_deg):
-    step = se3.from_rotation_vector(np.deg2rad([0.0, turn_deg, 0.0]), np.array([0.0, 0.0, length_m]))
+    step = se3.from_rotation_vector(
+        np.deg2rad([0.0, turn_deg, 0.0]), np.array([0.0, 0.0, length_m])
+    )
     road = measure(texture, step, pitch_deg)
     assert isinstance(road, RoadStep)
     assert road.length_heights * HEIGHT_M == pytest.approx(length_m, rel=0.02)
@@ -93,7 +103,10 @@ def test_lengths_are_right_on_average(texture):
     for k in range(16):
         T_road_camera = se3.make(np.eye(3), np.array([3.7 * k, 0.0, 11.3 * k % 20]))
         ahead = se3.make(np.eye(3), np.array([0.0, 0.0, 0.6 if k % 2 else 1.1]))
-        frames = [render(T, texture, index) for index, T in enumerate((T_road_camera, T_road_camera @ ahead))]
+        frames = [
+            render(T, texture, index)
+            for index, T in enumerate((T_road_camera, T_road_camera @ ahead))
+        ]
         road = RoadHomography(CAMERA).measure(*frames, ahead)
         assert isinstance(road, RoadStep)
         ratios.append(road.length_heights * HEIGHT_M / ahead[2, 3])
@@ -142,8 +155,13 @@ def test_what_is_no_road_is_refused_with_a_reason(texture, monkeypatch):
 
 def test_a_camera_that_looks_down_learns_its_pitch(texture):
     T_body_camera = pitched(-3.0)
-    T_step = se3.invert(T_body_camera) @ se3.make(np.eye(3), np.array([0.0, 0.0, 1.0])) @ T_body_camera
-    frames = [render(se3.make(np.eye(3), np.array([0.0, 0.0, k])) @ T_body_camera, texture, k) for k in range(3)]
+    T_step = (
+        se3.invert(T_body_camera) @ se3.make(np.eye(3), np.array([0.0, 0.0, 1.0])) @ T_body_camera
+    )
+    frames = [
+        render(se3.make(np.eye(3), np.array([0.0, 0.0, k])) @ T_body_camera, texture, k)
+        for k in range(3)
+    ]
     level = se3.make(np.eye(3), np.array([0.0, 0.0, 1.0]))
     road = RoadHomography(CAMERA)
     road.measure(frames[0], frames[1], T_step)
@@ -161,7 +179,9 @@ def drive(pitch: FloatArray, noise_deg: float = 0.0, missing: int | None = None)
     """Steps straight ahead on a level road; ``noise_deg`` is that of their directions, up and down."""
     rng = np.random.default_rng(0)
     R = Rotation.from_rotvec(np.outer(pitch, [1.0, 0.0, 0.0])).as_matrix()
-    T_world_camera = np.array([make(R[k], 7.0 * LENGTH_HEIGHTS * k * AHEAD) for k in range(STEPS + 1)])
+    T_world_camera = np.array(
+        [make(R[k], 7.0 * LENGTH_HEIGHTS * k * AHEAD) for k in range(STEPS + 1)]
+    )
     motions = []
     for k in range(STEPS):
         T_current_previous = invert(T_world_camera[k + 1]) @ T_world_camera[k]
@@ -187,7 +207,11 @@ def road_steps(pitch: FloatArray) -> dict[Ends, RoadStep]:
 
 def error(steps: dict[Ends, RoadStep]) -> float:
     """Root mean square of relative errors."""
-    return float(np.sqrt(np.mean([np.log(step.length_heights / LENGTH_HEIGHTS) ** 2 for step in steps.values()])))
+    return float(
+        np.sqrt(
+            np.mean([np.log(step.length_heights / LENGTH_HEIGHTS) ** 2 for step in steps.values()])
+        )
+    )
 
 
 @pytest.mark.parametrize("degrees", [0.3, 1.0])
@@ -226,7 +250,9 @@ def road_depth(height: float = HEIGHT, pitch_deg: float = 0.0, roll_deg: float =
     return np.where(facing > 0.01, height / np.maximum(facing, 0.01), 40.0).astype(np.float32)
 
 
-def spoiled(depth: np.ndarray, seed: int, noise: float = 0.05, outliers: float = 0.25) -> np.ndarray:
+def spoiled(
+    depth: np.ndarray, seed: int, noise: float = 0.05, outliers: float = 0.25
+) -> np.ndarray:
     rng = np.random.default_rng(seed)
     depth = depth * (1 + noise * rng.normal(size=depth.shape))
     wrong = rng.random(depth.shape) < outliers

@@ -39,7 +39,10 @@ STEPS_M = 1.0 + 0.2 * np.sin(np.arange(60) / 6.0)
 FRAMES = len(STEPS_M) + 1
 SINGLE = [(k, k + 1) for k in range(FRAMES - 1)]
 STEPS = 200
-RATIO_WIDENING, CORRELATED_WIDENING = 1.5, 1.5  # of the sigmas of ratios, and of those in the pose graph
+RATIO_WIDENING, CORRELATED_WIDENING = (
+    1.5,
+    1.5,
+)  # of the sigmas of ratios, and of those in the pose graph
 TRUE = 1.0 + 0.3 * np.sin(np.arange(STEPS) / 15.0)
 
 
@@ -57,17 +60,28 @@ def step(ends: Ends, unit: float, source: str) -> RelativePose:
 
 
 def measured(
-    road=True, planes=True, bias: float = 1.0, lidar: int = 0, height_m: float = HEIGHT_M, steps=SINGLE
+    road=True,
+    planes=True,
+    bias: float = 1.0,
+    lidar: int = 0,
+    height_m: float = HEIGHT_M,
+    steps=SINGLE,
 ) -> tuple[Drive, list[RelativePose]]:
     """A straight drive; ``bias`` makes the learned road lie too near, the first ``lidar`` steps have scans."""
     motions = [Motion(step(ends, UNIT, "essential"), np.eye(6)) for ends in steps]
     plane = bias * HEIGHT_M * UNIT if planes else Failed("dark")
-    roads = {ends: RoadStep(metres(ends) / height_m * DOWN, np.eye(3), DOWN, 0.06) for ends in steps} if road else {}
+    roads = (
+        {ends: RoadStep(metres(ends) / height_m * DOWN, np.eye(3), DOWN, 0.06) for ends in steps}
+        if road
+        else {}
+    )
     scans = [step(ends, 1.0, "lidar") for ends in SINGLE[:lidar]]
     return Drive(roads=[plane] * FRAMES, motions=motions, road_steps=roads), scans
 
 
-def find(mode, measurements: tuple[Drive, list[RelativePose]], height_m: float | None = HEIGHT_M) -> Scale:
+def find(
+    mode, measurements: tuple[Drive, list[RelativePose]], height_m: float | None = HEIGHT_M
+) -> Scale:
     return find_scale(mode, height_m, *measurements)
 
 
@@ -78,13 +92,17 @@ def lengths(scale: Scale) -> dict[Ends, float]:
 def assert_lengths(scale: Scale, expected: dict[Ends, float], rtol: float) -> None:
     found = lengths(scale)
     assert found.keys() == expected.keys()
-    np.testing.assert_allclose([found[ends] for ends in expected], list(expected.values()), rtol=rtol)
+    np.testing.assert_allclose(
+        [found[ends] for ends in expected], list(expected.values()), rtol=rtol
+    )
 
 
 TRUE_M = {ends: metres(ends) for ends in SINGLE}
 
 
-@pytest.mark.parametrize(("mode", "unit_m"), [("camera-height", 1.0), ("none", HEIGHT_M), ("reference", HEIGHT_M)])
+@pytest.mark.parametrize(
+    ("mode", "unit_m"), [("camera-height", 1.0), ("none", HEIGHT_M), ("reference", HEIGHT_M)]
+)
 @pytest.mark.parametrize("planes", [True, False])
 def test_the_road_in_the_image_outweighs_the_learned_road(mode, unit_m, planes):
     scale = find(mode, measured(planes=planes, bias=0.7))
@@ -96,7 +114,10 @@ def test_the_road_in_the_image_outweighs_the_learned_road(mode, unit_m, planes):
 
 def test_a_car_taken_for_the_road_for_half_the_drive_is_left_out():
     drive, scans = measured()
-    drive.road_steps |= {ends: replace(drive.road_steps[ends], plane=0.1 * metres(ends) * DOWN) for ends in SINGLE[:30]}
+    drive.road_steps |= {
+        ends: replace(drive.road_steps[ends], plane=0.1 * metres(ends) * DOWN)
+        for ends in SINGLE[:30]
+    }
     scale = find("camera-height", (drive, scans))
     assert_lengths(scale, TRUE_M, rtol=0.03)
     for length in scale.lengths.values():
@@ -135,7 +156,9 @@ def test_steps_that_skip_frames_have_lengths_by_their_two_frames():
     steps = [*SINGLE[:15], *((k, k + 3) for k in range(15, 39, 3)), (39, 40), *SINGLE[45:]]
     scale = find("camera-height", measured(bias=0.7, steps=steps))
     assert_lengths(scale, {ends: metres(ends) for ends in steps}, rtol=0.02)
-    np.testing.assert_allclose(scale.per_frame, 1 / UNIT, rtol=0.04)  # of 36 %: few steps against the learned road
+    np.testing.assert_allclose(
+        scale.per_frame, 1 / UNIT, rtol=0.04
+    )  # of 36 %: few steps against the learned road
     assert scale.estimate.frames_used == len(steps)
     unscaled = find("camera-height", measured(road=False, planes=False, steps=steps))
     assert_lengths(unscaled, {ends: UNIT * metres(ends) for ends in steps}, rtol=1e-6)
@@ -149,7 +172,9 @@ def test_lengths_by_learned_depth_alone_have_the_unit_at_their_first_frames():
     scale = find("camera-height", (replace(measured(road=False, steps=steps)[0], roads=planes), []))
     assert scale.per_frame[-1] > 1.03 * scale.per_frame[0]
     for ends in steps:
-        assert scale.lengths[ends].value == pytest.approx(scale.per_frame[ends[0]] * UNIT * metres(ends), rel=1e-4)
+        assert scale.lengths[ends].value == pytest.approx(
+            scale.per_frame[ends[0]] * UNIT * metres(ends), rel=1e-4
+        )
 
 
 def test_the_unit_is_that_of_the_first_frame_of_a_measurement():
@@ -164,7 +189,9 @@ def test_the_unit_is_that_of_the_first_frame_of_a_measurement():
 def test_a_later_estimate_scales_everything_and_a_failure_nothing():
     scale = find("none", measured())
     doubled = scale.in_metres(ScaleEstimate(2.0, 0.1, 9))
-    assert_lengths(doubled, {ends: 2.0 * length for ends, length in lengths(scale).items()}, rtol=1e-12)
+    assert_lengths(
+        doubled, {ends: 2.0 * length for ends, length in lengths(scale).items()}, rtol=1e-12
+    )
     np.testing.assert_allclose(doubled.per_frame, 2.0 * scale.per_frame)
     assert isinstance(doubled.estimate, ScaleEstimate) and doubled.estimate.frames_used == 9
     refused = scale.in_metres(Failed("it stands"))
@@ -272,7 +299,10 @@ def test_triangulation_propagates_rare_road_lengths_through_the_drive():
     """Where the road is seen in one step of forty and learned depth is twice too long, lengths are still right."""
     road = np.where(np.arange(STEPS) % 40 == 20, np.log(TRUE), np.nan)
     measured = evidence(
-        absolute=road, absolute_sigma=np.full(STEPS, 0.06), learned=noisy(0.05) + np.log(2.0), **ratios(0.003)
+        absolute=road,
+        absolute_sigma=np.full(STEPS, 0.06),
+        learned=noisy(0.05) + np.log(2.0),
+        **ratios(0.003),
     )
     solved = solve_lengths(measured)
     np.testing.assert_allclose(solved.length, TRUE, rtol=0.05)
@@ -302,7 +332,9 @@ def test_learned_depth_bridges_a_gap_in_the_unit_measured_around_it():
     tied["ratio"] = np.where(gap | np.roll(gap, 1), np.nan, tied["ratio"])
     road = np.where(gap, np.nan, np.log(TRUE))
     learned = np.log(0.7 * TRUE)
-    solved = solve_lengths(evidence(absolute=road, absolute_sigma=np.full(STEPS, 0.06), learned=learned, **tied))
+    solved = solve_lengths(
+        evidence(absolute=road, absolute_sigma=np.full(STEPS, 0.06), learned=learned, **tied)
+    )
     np.testing.assert_allclose(solved.length, TRUE, rtol=0.05)
     learned_only = solve_lengths(evidence(learned=learned))
     np.testing.assert_allclose(learned_only.length, 0.7 * TRUE, rtol=1e-6)
@@ -322,7 +354,12 @@ def test_steps_that_nothing_measured_have_no_length():
 def motion(ends: Ends, metres: float, unit: float, ratio: float, seconds: float = np.nan) -> Motion:
     """A step, whose ratio to the one before is measured."""
     T = from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, unit * metres]))
-    return Motion(RelativePose(*ends, T, np.full(6, 0.01), "essential"), np.eye(6), (np.log(ratio), 0.01), seconds)
+    return Motion(
+        RelativePose(*ends, T, np.full(6, 0.01), "essential"),
+        np.eye(6),
+        (np.log(ratio), 0.01),
+        seconds,
+    )
 
 
 def test_evidence_has_a_row_a_link_also_where_steps_skip_frames() -> None:
@@ -330,7 +367,9 @@ def test_evidence_has_a_row_a_link_also_where_steps_skip_frames() -> None:
     links = [(0, 1), (1, 2), (2, 5), (5, 6), (6, 7), (7, 8)]
     ratio = {(2, 5): 3.0, (5, 6): 1.0 / 3.0}
     motions = {
-        ends: motion(ends, float(ends[1] - ends[0]), 0.1, ratio.get(ends, 1.0)) for ends in links if ends != (6, 7)
+        ends: motion(ends, float(ends[1] - ends[0]), 0.1, ratio.get(ends, 1.0))
+        for ends in links
+        if ends != (6, 7)
     }
     absolute = {(2, 5): (3.1, 0.05), (5, 6): (1.2, 0.06), (6, 7): (9.0, 0.06), (3, 4): (1.0, 0.06)}
     unit = np.linspace(10.0, 20.0, 9)
@@ -362,7 +401,9 @@ def test_sigmas_are_those_of_the_whole_system() -> None:
     band = np.array([np.pad(np.diag(information, apart), (apart, 0)) for apart in (2, 1, 0)])
     sigmas, with_neighbours = marginals(band)
     np.testing.assert_allclose(sigmas, expected, rtol=1e-9)
-    both_sides = 0.5 * (np.append(correlations[0], correlations) + np.append(correlations, correlations[-1]))
+    both_sides = 0.5 * (
+        np.append(correlations[0], correlations) + np.append(correlations, correlations[-1])
+    )
     np.testing.assert_allclose(with_neighbours, both_sides, atol=1e-9)
 
 
@@ -372,11 +413,16 @@ def test_correlated_sigmas_are_those_of_sums_of_lengths(monkeypatch: pytest.Monk
     middle = slice(80, 120)
     alone, together = [], []
     for seed in range(60):
-        absolute = {"absolute": noisy(0.06, seed=300 + seed), "absolute_sigma": np.full(STEPS, 0.06)}
+        absolute = {
+            "absolute": noisy(0.06, seed=300 + seed),
+            "absolute_sigma": np.full(STEPS, 0.06),
+        }
         solved = solve_lengths(evidence(**absolute, **chained(0.02, seed)))
         summed = np.log(solved.length / TRUE)[middle].sum()
         alone.append(summed / np.linalg.norm(solved.relative_sigma[middle]))
-        together.append(CORRELATED_WIDENING * summed / np.linalg.norm(solved.relative_correlated_sigma[middle]))
+        together.append(
+            CORRELATED_WIDENING * summed / np.linalg.norm(solved.relative_correlated_sigma[middle])
+        )
     assert 0.75 < np.sqrt(np.square(together).mean()) < 1.3
     assert np.sqrt(np.square(alone).mean()) > 1.5
 

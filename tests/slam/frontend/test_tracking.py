@@ -25,7 +25,9 @@ def frames() -> list[Frame]:
     """A wide image that slides to the left by whole pixels."""
     noise = np.random.default_rng(0).integers(0, 255, (120, 300), np.uint8)
     wide = np.repeat(cv2.GaussianBlur(noise, (0, 0), 1.5)[..., None], 3, axis=2)
-    return [Frame(k, 0.1 * k, np.ascontiguousarray(wide[:, SHIFT_PX * k :][:, :200])) for k in range(6)]
+    return [
+        Frame(k, 0.1 * k, np.ascontiguousarray(wide[:, SHIFT_PX * k :][:, :200])) for k in range(6)
+    ]
 
 
 def test_tracks_move_with_the_image_and_keep_their_ids(frames):
@@ -64,8 +66,13 @@ def test_corners_are_tracked_across_two_frames_through_the_predicted_flow(frames
     tracker = CornerTracker()
     tracks = [tracker.track(frames[0], frames[1]), tracker.track(frames[1], frames[2])]
     camera = Intrinsics(200, 120, 100.0, 100.0, 100.0, 60.0)
-    depth, sliding = np.full((120, 200), 10.0, np.float32), UnitRelativePose(np.eye(3), np.array([-1.0, 0.0, 0.0]))
-    predicted = PredictedFlow(sliding, 2 * SHIFT_PX * 10.0 / 100.0 + 0.05, depth, camera)  # half a pixel too far
+    depth, sliding = (
+        np.full((120, 200), 10.0, np.float32),
+        UnitRelativePose(np.eye(3), np.array([-1.0, 0.0, 0.0])),
+    )
+    predicted = PredictedFlow(
+        sliding, 2 * SHIFT_PX * 10.0 / 100.0 + 0.05, depth, camera
+    )  # half a pixel too far
     across = tracker.track_across(frames[0], frames[2], predicted)()
     assert len(across.track_ids) > 0.8 * len(tracks[0].track_ids)
     assert np.isin(across.track_ids, tracks[0].track_ids).all()
@@ -76,7 +83,10 @@ def test_corners_are_tracked_across_two_frames_through_the_predicted_flow(frames
 def test_lost_corners_are_not_tracked_across(frames):
     camera = Intrinsics(200, 120, 100.0, 100.0, 100.0, 60.0)
     nothing = PredictedFlow(
-        UnitRelativePose(np.eye(3), np.array([0.0, 0.0, -1.0])), 0.0, np.ones((120, 200), np.float32), camera
+        UnitRelativePose(np.eye(3), np.array([0.0, 0.0, -1.0])),
+        0.0,
+        np.ones((120, 200), np.float32),
+        camera,
     )
     assert len(CornerTracker().track_across(frames[0], frames[2], nothing)().track_ids) == 0
 
@@ -139,9 +149,9 @@ def test_pixels_move_as_the_road_does():
 def test_without_depth_only_the_rotation_is_predicted():
     turn, _ = cv2.Rodrigues(np.array([0.0, -0.02, 0.0]))
     unknown = np.full((120, 320), np.nan, np.float32)
-    rotated = PredictedFlow(UnitRelativePose(turn, FORWARDS.direction), 5.0, unknown, CAMERA).in_current(
-        np.array([[160.0, 40.0]], np.float32)
-    )
+    rotated = PredictedFlow(
+        UnitRelativePose(turn, FORWARDS.direction), 5.0, unknown, CAMERA
+    ).in_current(np.array([[160.0, 40.0]], np.float32))
     np.testing.assert_allclose(rotated, [[160.0 - 240.0 * np.tan(0.02), 40.0]], atol=1e-3)
 
 
@@ -154,7 +164,9 @@ def test_corners_on_the_road_are_tracked_through_the_predicted_flow(road_frames)
     """Also with a length that is wrong by a tenth, as learned depth is."""
     plain = errors(CornerTracker().track(*road_frames))
     predicted = errors(CornerTracker().track(*road_frames, predicted_flow(0.9 * LENGTH)))
-    right_plain, right_predicted = ((np.abs(each).max(axis=1) < 0.3).sum() for each in (plain, predicted))
+    right_plain, right_predicted = (
+        (np.abs(each).max(axis=1) < 0.3).sum() for each in (plain, predicted)
+    )
     assert right_predicted > max(2 * right_plain, 25)
     assert abs(np.median(predicted[:, 1])) < 0.15
 

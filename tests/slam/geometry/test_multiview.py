@@ -24,23 +24,39 @@ from slam.geometry.multiview import (
     unit_pose_by_essential,
     unit_pose_by_pnp,
 )
-from slam.geometry.se3 import FloatArray, apply, from_rotation_vector, invert, is_se3, rotation_angle
+from slam.geometry.se3 import (
+    FloatArray,
+    apply,
+    from_rotation_vector,
+    invert,
+    is_se3,
+    rotation_angle,
+)
 
 K = np.array([[240.0, 0.0, 160.0], [0.0, 240.0, 60.0], [0.0, 0.0, 1.0]])
-T_CAMERA_POINTS = se3.from_rotation_vector(np.array([0.02, -0.05, 0.01]), np.array([0.1, -0.05, -0.8]))
+T_CAMERA_POINTS = se3.from_rotation_vector(
+    np.array([0.02, -0.05, 0.01]), np.array([0.1, -0.05, -0.8])
+)
 INTRINSICS = Intrinsics(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
 T_TRUE = from_rotation_vector(np.array([0.1, -0.2, 0.3]), np.array([0.2, 0.1, -0.3]))
 FOCAL_PX = 240.0
 LENGTH = 0.8
-T_CURRENT_PREVIOUS = se3.from_rotation_vector(np.deg2rad([0.3, -2.0, 0.2]), LENGTH * np.array([0.28, 0.0, -0.96]))
+T_CURRENT_PREVIOUS = se3.from_rotation_vector(
+    np.deg2rad([0.3, -2.0, 0.2]), LENGTH * np.array([0.28, 0.0, -0.96])
+)
 UNIT_POSE = UnitRelativePose(T_CURRENT_PREVIOUS[:3, :3], T_CURRENT_PREVIOUS[:3, 3] / LENGTH)
 
 
-def scene(seed: int, noise_px: float = 0.3, outliers: int = 30) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+def scene(
+    seed: int, noise_px: float = 0.3, outliers: int = 30
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """100 points ``(100, 3)``, their pixels ``(100, 2)``, and which of them are inliers."""
     rng = np.random.default_rng(seed)
     depth = rng.uniform(4.0, 25.0, 100)
-    points = np.column_stack([rng.uniform(-0.6, 0.6, 100), rng.uniform(-0.2, 0.2, 100), np.ones(100)]) * depth[:, None]
+    points = (
+        np.column_stack([rng.uniform(-0.6, 0.6, 100), rng.uniform(-0.2, 0.2, 100), np.ones(100)])
+        * depth[:, None]
+    )
     seen = se3.apply(T_CAMERA_POINTS, points) @ K.T
     pixels = seen[:, :2] / seen[:, 2:] + noise_px * rng.normal(size=(100, 2))
     wrong = rng.permutation(100)[:outliers]
@@ -49,7 +65,9 @@ def scene(seed: int, noise_px: float = 0.3, outliers: int = 30) -> tuple[FloatAr
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_camera_is_found_among_outliers_and_inliers_are_rows_of_the_points_given(seed: int) -> None:
+def test_a_camera_is_found_among_outliers_and_inliers_are_rows_of_the_points_given(
+    seed: int,
+) -> None:
     points, pixels, is_inlier = scene(5)
     T_start, inliers = consensus(points, pixels, K, 200, 2.0, seed)
     assert set(inliers) <= set(np.flatnonzero(is_inlier)) and len(inliers) > 60
@@ -74,7 +92,12 @@ def test_sigmas_are_those_of_the_errors_of_refined_cameras() -> None:
         resection = resect([T_start], points[inliers], pixels[inliers], K)
         error = resection.T_camera_world @ se3.invert(T_CAMERA_POINTS)
         shift = error[:3, 3]
-        turned = np.array([error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1]]) / 2
+        turned = (
+            np.array(
+                [error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1]]
+            )
+            / 2
+        )
         whitened.append(np.concatenate([turned, shift]) / resection.sigmas)
     rms = np.sqrt(np.square(whitened).mean(axis=0))
     assert (rms > 0.7).all() and (rms < 1.4).all(), rms
@@ -101,7 +124,9 @@ def test_jacobian_is_the_derivative_of_the_pixels() -> None:
     for axis in range(6):
         step = np.zeros(6)
         step[axis] = 1e-6
-        ahead, behind = (apply(from_rotation_vector(s * step[:3], s * step[3:]), X) for s in (1.0, -1.0))
+        ahead, behind = (
+            apply(from_rotation_vector(s * step[:3], s * step[3:]), X) for s in (1.0, -1.0)
+        )
         numeric = (ahead[:, :2] / ahead[:, 2:] - behind[:, :2] / behind[:, 2:]) * focal / 2e-6
         np.testing.assert_allclose(pixel_jacobian(X, focal)[axis].T, numeric, atol=1e-4)
 
@@ -122,7 +147,9 @@ def test_a_camera_that_moves_and_turns_steadily_stays_rigid() -> None:
         true = T_step @ true
         points = rng.uniform((-2.0, -1.5, 3.0), (2.0, 1.5, 6.0), (40, 3))
         predicted = now @ invert(before) @ now
-        found = resect((predicted,), apply(invert(true), points), INTRINSICS.project(points), INTRINSICS.K)
+        found = resect(
+            (predicted,), apply(invert(true), points), INTRINSICS.project(points), INTRINSICS.K
+        )
         before, now = now, found.T_camera_world
     assert is_se3(now, tolerance=1e-12)
     assert rotation_angle(now[:3, :3] @ true[:3, :3].T) < 1e-6
@@ -166,10 +193,14 @@ def test_the_majority_is_not_the_world_where_others_have_the_vote() -> None:
     assert (pose.residual_px[~trusted] > 3.0).all()
 
 
-def matched_rays(noise_px: float = 0.0, outliers: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
+def matched_rays(
+    noise_px: float = 0.0, outliers: int = 0
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Rays ``(120, 3)`` in both cameras, the first ``outliers`` of them wrong, and the depths in the earlier one."""
     rng = np.random.default_rng(0)
-    previous = np.column_stack([rng.uniform(-0.8, 0.8, 120), rng.uniform(-0.25, 0.25, 120), np.ones(120)])
+    previous = np.column_stack(
+        [rng.uniform(-0.8, 0.8, 120), rng.uniform(-0.25, 0.25, 120), np.ones(120)]
+    )
     depth = rng.uniform(4.0, 30.0, 120)
     moved = se3.apply(T_CURRENT_PREVIOUS, previous * depth[:, None])
     current = moved / moved[:, 2:]
@@ -201,7 +232,10 @@ def test_both_consensus_methods_find_the_motion_among_outliers(seed: int) -> Non
 
 def test_too_few_points_have_no_motion() -> None:
     previous, current, depth = matched_rays()
-    assert unit_pose_by_pnp(previous, current, np.where(np.arange(120) < 7, depth, np.nan), 1e-2) is None
+    assert (
+        unit_pose_by_pnp(previous, current, np.where(np.arange(120) < 7, depth, np.nan), 1e-2)
+        is None
+    )
 
 
 def test_depths_are_triangulated_in_both_cameras() -> None:
@@ -209,7 +243,9 @@ def test_depths_are_triangulated_in_both_cameras() -> None:
     found = triangulated_depth(previous, current, UNIT_POSE)
     np.testing.assert_allclose(found * LENGTH, depth, rtol=1e-9)
     in_current = se3.apply(T_CURRENT_PREVIOUS, previous * depth[:, None])[:, 2]
-    np.testing.assert_allclose(depth_in_current(previous, found, UNIT_POSE) * LENGTH, in_current, rtol=1e-9)
+    np.testing.assert_allclose(
+        depth_in_current(previous, found, UNIT_POSE) * LENGTH, in_current, rtol=1e-9
+    )
     backwards = UnitRelativePose(UNIT_POSE.R_current_previous, -UNIT_POSE.direction)
     assert (triangulated_depth(previous, current, backwards) < 0).all()
 
@@ -218,9 +254,14 @@ def test_parallax_is_the_flow_without_that_of_the_rotation() -> None:
     previous, _, _ = matched_rays()
     rotated = previous @ UNIT_POSE.R_current_previous.T
     rotated /= rotated[:, 2:]
-    assert parallax_px(previous, rotated, UNIT_POSE.R_current_previous, (FOCAL_PX, FOCAL_PX)).max() < 1e-9
+    assert (
+        parallax_px(previous, rotated, UNIT_POSE.R_current_previous, (FOCAL_PX, FOCAL_PX)).max()
+        < 1e-9
+    )
     shifted = rotated + np.array([3.0, 4.0, 0.0]) / FOCAL_PX
-    np.testing.assert_allclose(parallax_px(previous, shifted, UNIT_POSE.R_current_previous, (FOCAL_PX, FOCAL_PX)), 5.0)
+    np.testing.assert_allclose(
+        parallax_px(previous, shifted, UNIT_POSE.R_current_previous, (FOCAL_PX, FOCAL_PX)), 5.0
+    )
 
 
 def test_a_pure_rotation_is_found_with_a_fifth_of_outliers() -> None:

@@ -18,7 +18,9 @@ def rng() -> np.random.Generator:
 
 
 def random_poses(rng: np.random.Generator, count: int) -> FloatArray:
-    return se3.make(Rotation.random(count, rng=rng).as_matrix(), rng.normal(scale=10.0, size=(count, 3)))
+    return se3.make(
+        Rotation.random(count, rng=rng).as_matrix(), rng.normal(scale=10.0, size=(count, 3))
+    )
 
 
 def test_make_and_apply_hand_value() -> None:
@@ -29,7 +31,9 @@ def test_make_and_apply_hand_value() -> None:
 
 def test_invert_undoes_and_keeps_stacks(rng: np.random.Generator) -> None:
     T_a_b = random_poses(rng, 12).reshape(3, 4, 4, 4)
-    np.testing.assert_allclose(se3.invert(T_a_b) @ T_a_b, np.broadcast_to(np.eye(4), T_a_b.shape), atol=1e-14)
+    np.testing.assert_allclose(
+        se3.invert(T_a_b) @ T_a_b, np.broadcast_to(np.eye(4), T_a_b.shape), atol=1e-14
+    )
     np.testing.assert_allclose(se3.invert(se3.invert(T_a_b)), T_a_b, atol=1e-14)
 
 
@@ -49,7 +53,9 @@ def test_chain_rebuilds_poses_from_their_increments(rng: np.random.Generator) ->
     np.testing.assert_array_equal(se3.chain(np.zeros((0, 4, 4))), np.eye(4)[None])
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-8, 1e-3, 1.0, math.pi / 2, math.pi - 1e-6, math.pi])
+@pytest.mark.parametrize(
+    "angle", [0.0, 1e-12, 1e-8, 1e-3, 1.0, math.pi / 2, math.pi - 1e-6, math.pi]
+)
 def test_rotation_angle_at_both_ends(angle: float) -> None:
     axis = np.array([2.0, 3.0, -6.0]) / 7.0
     R = se3.from_rotation_vector(angle * axis, np.zeros(3))[:3, :3]
@@ -58,7 +64,9 @@ def test_rotation_angle_at_both_ends(angle: float) -> None:
 
 def test_from_rotation_vector_hand_value() -> None:
     T_a_b = se3.from_rotation_vector(np.array([0.0, 0.0, math.pi / 2]), np.array([1.0, 2.0, 3.0]))
-    np.testing.assert_allclose(T_a_b, se3.make(QUARTER_ABOUT_Z, np.array([1.0, 2.0, 3.0])), atol=1e-15)
+    np.testing.assert_allclose(
+        T_a_b, se3.make(QUARTER_ABOUT_Z, np.array([1.0, 2.0, 3.0])), atol=1e-15
+    )
 
 
 def test_nearest_rotation_keeps_rotations_and_repairs_stacks(rng: np.random.Generator) -> None:
@@ -82,7 +90,9 @@ def test_umeyama_finds_a_known_similarity(rng: np.random.Generator, scale: float
 def test_umeyama_without_scale_agrees_with_kabsch(rng: np.random.Generator) -> None:
     points_a, points_b = rng.normal(size=(2, 30, 3))
     fit = se3.umeyama(points_a, points_b, with_scale=False)
-    kabsch, _ = Rotation.align_vectors(points_a - points_a.mean(axis=0), points_b - points_b.mean(axis=0))
+    kabsch, _ = Rotation.align_vectors(
+        points_a - points_a.mean(axis=0), points_b - points_b.mean(axis=0)
+    )
     assert fit.scale == 1.0
     np.testing.assert_allclose(fit.R_a_b, kabsch.as_matrix(), atol=1e-10)
 
@@ -90,7 +100,9 @@ def test_umeyama_without_scale_agrees_with_kabsch(rng: np.random.Generator) -> N
 def test_umeyama_of_a_planar_path_is_no_mirror_image(rng: np.random.Generator) -> None:
     points_b = rng.normal(size=(10, 3)) * [1.0, 0.0, 1.0]
     R_a_b = Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix()
-    np.testing.assert_allclose(se3.umeyama(points_b @ R_a_b.T, points_b, True).R_a_b, R_a_b, atol=1e-12)
+    np.testing.assert_allclose(
+        se3.umeyama(points_b @ R_a_b.T, points_b, True).R_a_b, R_a_b, atol=1e-12
+    )
 
 
 def test_a_similarity_moves_poses_as_it_moves_their_positions(rng: np.random.Generator) -> None:

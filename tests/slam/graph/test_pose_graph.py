@@ -11,7 +11,9 @@ ROTATION, TRANSLATION = 0.003, 0.03
 
 def circle(count: int, rounds: float = 2.0, radius: float = 30.0) -> np.ndarray:
     angle = np.linspace(0.0, 2 * np.pi * rounds, count)
-    turn = se3.from_rotation_vector(np.stack([0 * angle, angle, 0 * angle], axis=1), np.zeros((count, 3)))
+    turn = se3.from_rotation_vector(
+        np.stack([0 * angle, angle, 0 * angle], axis=1), np.zeros((count, 3))
+    )
     turn[:, :3, 3] = radius * np.stack([-np.cos(angle), 0.02 * angle, np.sin(angle)], axis=1)
     return se3.invert(turn[0]) @ turn
 
@@ -111,7 +113,10 @@ def test_whitened_residual_by_hand():
 def test_g2o_round_trip_through_gtsam(tmp_path):
     _, odometry, _, loops, initial = noisy_problem(count=50)
     sigmas = np.array([0.01, 0.02, 0.03, 0.1, 0.2, 0.3])
-    edges = [RelativePose(e.from_index, e.to_index, e.T_from_to, sigmas, e.source) for e in odometry + loops]
+    edges = [
+        RelativePose(e.from_index, e.to_index, e.T_from_to, sigmas, e.source)
+        for e in odometry + loops
+    ]
     graph, solved = solve(edges, initial)
     path = tmp_path / "graph.g2o"
     graph.write_g2o(path)
@@ -119,7 +124,9 @@ def test_g2o_round_trip_through_gtsam(tmp_path):
     assert values.size() == 50
     for k in range(50):
         np.testing.assert_allclose(values.atPose3(k).matrix(), solved[k], atol=1e-12)
-    between = [read.at(k) for k in range(read.size()) if isinstance(read.at(k), gtsam.BetweenFactorPose3)]
+    between = [
+        read.at(k) for k in range(read.size()) if isinstance(read.at(k), gtsam.BetweenFactorPose3)
+    ]
     assert len(between) == len(edges)
     for factor, e in zip(between, edges, strict=True):
         assert factor.keys() == [e.from_index, e.to_index]
@@ -130,14 +137,18 @@ def test_g2o_round_trip_through_gtsam(tmp_path):
 
 def test_a_loop_contradicted_by_the_rest_is_dropped():
     truth, odometry, skips, loops, initial = noisy_problem()
-    wrong = truth[0] @ truth[100] @ se3.from_rotation_vector(np.zeros(3), np.array([30.0, 0.0, 0.0]))
+    wrong = (
+        truth[0] @ truth[100] @ se3.from_rotation_vector(np.zeros(3), np.array([30.0, 0.0, 0.0]))
+    )
     false = RelativePose(20, 120, wrong, loops[0].sigmas, LOOP_SOURCE)
     graph = PoseGraph()
     graph.add_relative(*odometry, *skips, *loops, false)
     graph.optimise(initial)
     assert graph.drop_contradicted() and graph.dropped == [false]
     graph.optimise(initial)
-    assert not graph.drop_contradicted() and len(graph.relative_poses) == len(odometry + skips + loops)
+    assert not graph.drop_contradicted() and len(graph.relative_poses) == len(
+        odometry + skips + loops
+    )
 
 
 def test_positions_far_from_all_others_are_dropped():

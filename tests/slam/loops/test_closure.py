@@ -70,7 +70,9 @@ def is_false(loop: Loop, T_true: FloatArray) -> bool:
     """More than 2 m or 5 degrees off the truth: the design, section 7."""
     earlier, later = loop.ends
     error = invert(invert(T_true[earlier]) @ T_true[later]) @ loop.measured.T_from_to
-    return bool(np.linalg.norm(error[:3, 3]) > 2.0 or rotation_angle(error[:3, :3]) > np.deg2rad(5.0))
+    return bool(
+        np.linalg.norm(error[:3, 3]) > 2.0 or rotation_angle(error[:3, :3]) > np.deg2rad(5.0)
+    )
 
 
 def ate(result: Estimate, name: str) -> float:
@@ -91,8 +93,15 @@ def test_a_loop_is_closed_and_cuts_the_error(seed: int) -> None:
     assert not any(is_false(loop, sequence.reference) for loop in accepted)
     assert ate(result, "optimised") < 0.6 * ate(result, "odometry")
     details = json.loads(json.dumps(result.loops.details()))
-    assert result.loops.candidates >= result.loops.verified >= len(accepted) == len(details["accepted"])
-    assert 0 < len(details["rejected"]) <= MOST_REJECTED and all(r["reason"] for r in details["rejected"])
+    assert (
+        result.loops.candidates
+        >= result.loops.verified
+        >= len(accepted)
+        == len(details["accepted"])
+    )
+    assert 0 < len(details["rejected"]) <= MOST_REJECTED and all(
+        r["reason"] for r in details["rejected"]
+    )
     assert {"from", "to", "inliers", "score", "reason", "T_from_to"} <= set(details["accepted"][0])
 
 
@@ -106,7 +115,9 @@ def test_loops_of_a_drive_without_metres_are_those_of_one_with() -> None:
         T_world_camera = result.odometry.T_world_camera.copy()
         T_world_camera[:, :3, 3] *= scale
         views = [view.scaled(scale * float(per_frame[view.index])) for view in result.drive.views]
-        found = close_loops(views, T_world_camera, sequence.intrinsics, LoopsConfig(), is_metric=False)
+        found = close_loops(
+            views, T_world_camera, sequence.intrinsics, LoopsConfig(), is_metric=False
+        )
         return {loop.ends for loop in found.accepted}
 
     metric = {loop.ends for loop in result.loops.accepted}
@@ -125,12 +136,16 @@ def test_a_car_that_waits_at_a_place_has_one_loop_there() -> None:
     stands = np.concatenate([T, np.repeat(T[-1:], 40, axis=0)])
 
     def information(T_world_camera: FloatArray, seen: list[View]) -> FloatArray:
-        found = close_loops(seen, T_world_camera, sequence.intrinsics, LoopsConfig(), is_metric=True).accepted
+        found = close_loops(
+            seen, T_world_camera, sequence.intrinsics, LoopsConfig(), is_metric=True
+        ).accepted
         there = [one.measured.sigmas for one in found if one.ends[1] >= loop.ends[1]]
         assert len(there) > (len(T_world_camera) - len(T)) / 4
         return np.sum([sigmas**-2.0 for sigmas in there], axis=0)
 
-    np.testing.assert_allclose(information(stands, views + waiting), information(T, views), rtol=0.3)
+    np.testing.assert_allclose(
+        information(stands, views + waiting), information(T, views), rtol=0.3
+    )
 
 
 def test_a_straight_drive_has_no_loop() -> None:
@@ -160,7 +175,11 @@ def ring(yaw_error: float = 0.0) -> FloatArray:
 
 
 def loop(earlier: int, later: int, T: FloatArray, shift: float = 0.0, inliers: int = 40) -> Loop:
-    T_from_to = invert(T[earlier]) @ T[later] @ from_rotation_vector(np.zeros(3), np.array([shift, 0.0, 0.0]))
+    T_from_to = (
+        invert(T[earlier])
+        @ T[later]
+        @ from_rotation_vector(np.zeros(3), np.array([shift, 0.0, 0.0]))
+    )
     return Loop(RelativePose(earlier, later, T_from_to, SIGMAS, LOOP_SOURCE), inliers, 0.5)
 
 
@@ -172,22 +191,31 @@ def test_loops_of_one_stretch_support_each_other_despite_drift() -> None:
 
 def test_a_contradicted_loop_is_refused() -> None:
     true = [loop(k, 200 + k, ring()) for k in range(0, 40, 4)]
-    kept, refused = agreeing([*true, loop(6, 206, ring(), shift=8.0)], Track.of_drive(ring()), OF_FRAMES)
+    kept, refused = agreeing(
+        [*true, loop(6, 206, ring(), shift=8.0)], Track.of_drive(ring()), OF_FRAMES
+    )
     assert [k.ends for k in kept] == [k.ends for k in true]
     assert [r.from_index for r in refused] == [6] and "contradicted by 7 of 7" in refused[0].reason
 
 
 def test_a_loop_without_support_needs_many_inliers() -> None:
     for inliers, expected in ((40, 0), (300, 1)):
-        kept, refused = agreeing([loop(5, 205, ring(), inliers=inliers)], Track.of_drive(ring()), OF_FRAMES)
+        kept, refused = agreeing(
+            [loop(5, 205, ring(), inliers=inliers)], Track.of_drive(ring()), OF_FRAMES
+        )
         assert len(kept) == expected and len(kept) + len(refused) == 1
-    assert "lacks support" in agreeing([loop(5, 205, ring())], Track.of_drive(ring()), OF_FRAMES)[1][0].reason
+    assert (
+        "lacks support"
+        in agreeing([loop(5, 205, ring())], Track.of_drive(ring()), OF_FRAMES)[1][0].reason
+    )
 
 
 def test_loops_that_move_the_trajectory_too_far_are_refused() -> None:
     far = [loop(k, 100 + k, ring(), shift=-60.0, inliers=300) for k in range(0, 40, 4)]
     kept, refused = agreeing(far, Track.of_drive(ring()), OF_FRAMES)
-    assert kept == [] and all("corrects the odometry by more than 30% of" in r.reason for r in refused)
+    assert kept == [] and all(
+        "corrects the odometry by more than 30% of" in r.reason for r in refused
+    )
 
 
 def test_a_loop_between_maps_may_not_contradict_the_motion_between_them() -> None:

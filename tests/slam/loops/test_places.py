@@ -7,7 +7,11 @@ from slam.loops.places import reprojection_errors, triangulate
 def test_points_and_angles_of_exact_rays() -> None:
     rng = np.random.default_rng(0)
     X = rng.uniform((-1.0, -1.0, 3.0), (1.0, 1.0, 5.0), (8, 3))
-    T = invert(from_rotation_vector(rng.normal(0.0, 0.1, (3, 3)), np.array([[0.0, 0, 0], [0.5, 0, 0], [0.0, 0.2, 0]])))
+    T = invert(
+        from_rotation_vector(
+            rng.normal(0.0, 0.1, (3, 3)), np.array([[0.0, 0, 0], [0.5, 0, 0], [0.0, 0.2, 0]])
+        )
+    )
     camera, point = (rows.ravel() for rows in np.meshgrid(range(3), range(8), indexing="ij"))
     rays = np.concatenate([apply(T[c], X[[p]]) for c, p in zip(camera, point, strict=True)])
     found, angle = triangulate(T[camera], rays / rays[:, 2:], point, 8)

@@ -18,19 +18,28 @@ T_A_B = from_rotation_vector(np.array([0.01, 0.08, -0.02]), np.array([0.7, 0.1, 
 class Scene:
     """Points before two cameras; ``unit`` and ``noise`` are those of the depth kept in the views."""
 
-    def __init__(self, T_a_b: FloatArray = T_A_B, count: int = 200, noise: float = 0.0, unit: float = 1.0) -> None:
+    def __init__(
+        self, T_a_b: FloatArray = T_A_B, count: int = 200, noise: float = 0.0, unit: float = 1.0
+    ) -> None:
         rng = np.random.default_rng(0)
         u, v = rng.uniform(60, 350, count), rng.uniform(20, 110, count)
         z = rng.uniform(6.0, 25.0, count)
         self.descriptors = rng.integers(0, 256, (count, 32), dtype=np.uint8)
-        self.points_a = np.stack([(u - CAMERA.cx) / CAMERA.fx * z, (v - CAMERA.cy) / CAMERA.fy * z, z], axis=1)
+        self.points_a = np.stack(
+            [(u - CAMERA.cx) / CAMERA.fx * z, (v - CAMERA.cy) / CAMERA.fy * z, z], axis=1
+        )
         self.points_b = apply(invert(T_a_b), self.points_a)
         self.rng, self.noise, self.unit = rng, noise, unit
 
     def view(self, index: int, points: FloatArray) -> View:
         pixels = (points / points[:, 2:]) @ CAMERA.K.T
         wrong = self.unit * np.exp(self.noise * self.rng.normal(size=(len(points), 1)))
-        return View(index, pixels[:, :2].astype(np.float32), self.descriptors, (points * wrong).astype(np.float32))
+        return View(
+            index,
+            pixels[:, :2].astype(np.float32),
+            self.descriptors,
+            (points * wrong).astype(np.float32),
+        )
 
     def views(self) -> tuple[View, View]:
         return self.view(3, self.points_a), self.view(90, self.points_b)
@@ -42,7 +51,9 @@ def verify(earlier: View, later: View, **changes: float) -> Loop | RejectedLoop:
 
 def error(loop: Loop, T_true: FloatArray) -> tuple[float, float]:
     difference = invert(T_true) @ loop.measured.T_from_to
-    return float(np.linalg.norm(difference[:3, 3])), float(np.rad2deg(rotation_angle(difference[:3, :3])))
+    return float(np.linalg.norm(difference[:3, 3])), float(
+        np.rad2deg(rotation_angle(difference[:3, :3]))
+    )
 
 
 def test_exact_points_give_the_pose() -> None:
@@ -62,18 +73,24 @@ def test_verdict_does_not_depend_on_the_unit(unit: float) -> None:
     assert loop.measured.sigmas[3] == pytest.approx(unit * 0.085, rel=0.1)
 
 
-def test_sigmas_grow_with_the_error_of_corners_and_cover_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sigmas_grow_with_the_error_of_corners_and_cover_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(recognition, "_LENGTH_RELATIVE_SIGMA", 1e-6)
     whitened, sizes = [], []
     for sigma_px in (0.3, 1.0):
         for seed in range(12):
-            views = Scene(from_rotation_vector(np.array([0.0, 0.05, 0.0]), np.array([0.5, 0.0, 0.0]))).views()
+            views = Scene(
+                from_rotation_vector(np.array([0.0, 0.05, 0.0]), np.array([0.5, 0.0, 0.0]))
+            ).views()
             rng = np.random.default_rng(seed)
             for view in views:
                 view.pixels[:] += rng.normal(size=view.pixels.shape) * sigma_px
             loop = verify(*views)
             assert isinstance(loop, Loop)
-            T_error = invert(from_rotation_vector(np.array([0.0, 0.05, 0.0]), np.array([0.5, 0.0, 0.0])))
+            T_error = invert(
+                from_rotation_vector(np.array([0.0, 0.05, 0.0]), np.array([0.5, 0.0, 0.0]))
+            )
             T_error = T_error @ loop.measured.T_from_to
             vee = [T_error[2, 1], T_error[0, 2], T_error[1, 0], *T_error[:3, 3]]
             whitened.append(np.array(vee) / loop.measured.sigmas)
@@ -117,7 +134,12 @@ def seen_again(descriptors: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def view(index: int, descriptors: np.ndarray) -> View:
     count = len(descriptors)
-    return View(index, np.zeros((count, 2), np.float32), descriptors, np.full((count, 3), np.nan, np.float32))
+    return View(
+        index,
+        np.zeros((count, 2), np.float32),
+        descriptors,
+        np.full((count, 3), np.nan, np.float32),
+    )
 
 
 def drive(places: int, again: int) -> list[View]:
@@ -125,7 +147,9 @@ def drive(places: int, again: int) -> list[View]:
     rng = np.random.default_rng(0)
     known = [place(rng) for _ in range(places)]
     order = [*range(places), *range(again)]
-    return [view(2 * k + j, seen_again(known[p], rng)) for k, p in enumerate(order) for j in range(2)]
+    return [
+        view(2 * k + j, seen_again(known[p], rng)) for k, p in enumerate(order) for j in range(2)
+    ]
 
 
 def apart(path: np.ndarray) -> Apart:

@@ -46,7 +46,9 @@ def street_map() -> StreetMap:
             noise = np.random.default_rng(k).normal(0, 2, (CAMERA.height, CAMERA.width, 1))
             image = np.clip(grey(k) + noise, 0, 255).astype(np.uint8).repeat(3, axis=2)
             T_world_camera = se3.make(np.eye(3), np.array([0.0, 0.0, per_metre * k]))
-            tsdf_map.integrate(KeyframeDepth(k, np.float32(per_metre) * depth, None, image, T_world_camera))
+            tsdf_map.integrate(
+                KeyframeDepth(k, np.float32(per_metre) * depth, None, image, T_world_camera)
+            )
         return tsdf_map
 
     return make

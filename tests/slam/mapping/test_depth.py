@@ -20,7 +20,9 @@ def refiner(distances: np.ndarray, read: list[int]) -> DepthRefiner:
         read.append(n)
         return rng.integers(0, 255, (32, 64, 3), dtype=np.uint8)
 
-    return DepthRefiner(CAMERA, range(len(distances)), T_world_camera, image, DepthFusion("default").decide)
+    return DepthRefiner(
+        CAMERA, range(len(distances)), T_world_camera, image, DepthFusion("default").decide
+    )
 
 
 @pytest.mark.parametrize(("step_m", "expected"), [(1.0, {9, 10, 11, 12}), (0.1, {10, 3, 17, 30})])

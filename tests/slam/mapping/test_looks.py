@@ -14,7 +14,10 @@ from slam.mapping.surface import TileSurface, with_holes_closed
 
 def test_exposure_is_evened_out(street_map):
     flat = street_map(grey=lambda k: 120.0, frames=12).mesh().colours / 255
-    changing = street_map(grey=lambda k: 120.0 * (1.5 if (k // 4) % 2 else 1.0), frames=12).mesh().colours / 255
+    changing = (
+        street_map(grey=lambda k: 120.0 * (1.5 if (k // 4) % 2 else 1.0), frames=12).mesh().colours
+        / 255
+    )
     assert flat.std() < 0.02
     assert changing.std() < 0.03  # 0.1 without it
     assert 0.4 < changing.mean() < 0.75
@@ -25,10 +28,14 @@ def test_a_view_without_depth_paints_nothing_right_before_it(monkeypatch):
     camera = Intrinsics(104, 64, 60.0, 60.0, 51.5, 31.5)
     x, y = np.moveaxis(camera.rays(camera.pixel_grid()), -1, 0)[:2]
     tsdf_map = TsdfMap(MappingConfig(), camera)
-    for frame, z in enumerate((0.0, 0.5, 1.0, 7.85, 8.35)):  # a red plate at 8 m, unknown to the last two green views
+    for frame, z in enumerate(
+        (0.0, 0.5, 1.0, 7.85, 8.35)
+    ):  # a red plate at 8 m, unknown to the last two green views
         walls = 6 / np.maximum(np.abs(x), 0.01)
         is_plate = (np.abs(x) < 0.2) & (np.abs(y) < 0.2)
-        depth = np.where(is_plate, 8.0 - z if z < 7 else 0.0, np.where(walls < 20, walls, 0.0)).astype(np.float32)
+        depth = np.where(
+            is_plate, 8.0 - z if z < 7 else 0.0, np.where(walls < 20, walls, 0.0)
+        ).astype(np.float32)
         image = np.full((64, 104, 3), (200, 0, 0) if z < 7 else (0, 200, 0), np.uint8)
         T_world_camera = np.eye(4)
         T_world_camera[2, 3] = z
@@ -58,19 +65,25 @@ def test_a_hole_of_the_road_is_closed_and_marked(street_map, monkeypatch):
     assert not street_map(hidden=True, close_holes_m=1.5).mesh().vertices["filled"].any()
 
 
-@pytest.mark.parametrize(("up", "closed"), [((0.0, 0.0, 1.0), 1), ((0.0, 0.0, -1.0), 0), ((1.0, 0.0, 0.0), 0)])
+@pytest.mark.parametrize(
+    ("up", "closed"), [((0.0, 0.0, 1.0), 1), ((0.0, 0.0, -1.0), 0), ((1.0, 0.0, 0.0), 0)]
+)
 def test_only_holes_that_look_upwards_are_closed(up: tuple[float, float, float], closed: int):
     """A sheet of 5 x 5 squares that looks along z, without the one in the middle."""
     x, y = (each.ravel() for each in np.meshgrid(np.arange(6), np.arange(6), indexing="ij"))
     vertices = np.stack([x, y, np.zeros(36)], axis=1) * 0.2 + 1.0
     squares = [(i, j) for i in range(5) for j in range(5) if (i, j) != (2, 2)]
-    corners = np.array([[6 * i + j, 6 * (i + 1) + j, 6 * (i + 1) + j + 1, 6 * i + j + 1] for i, j in squares])
+    corners = np.array(
+        [[6 * i + j, 6 * (i + 1) + j, 6 * (i + 1) + j + 1, 6 * i + j + 1] for i, j in squares]
+    )
     triangles = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
     sheet = TileSurface(vertices, triangles, np.ones(48, dtype=bool), np.zeros(48, dtype=bool))
     full = with_holes_closed(sheet, np.zeros(3, np.int64), 0.2, np.array(up), 1.5)
     assert len(full.vertices) - 36 == closed and full.filled.sum() == 4 * closed and full.own.all()
     np.testing.assert_allclose(full.vertices[36:], np.tile([1.5, 1.5, 1.0], (closed, 1)))
-    normals = np.cross(*(full.vertices[full.triangles[:, k]] - full.vertices[full.triangles[:, 0]] for k in (1, 2)))
+    normals = np.cross(
+        *(full.vertices[full.triangles[:, k]] - full.vertices[full.triangles[:, 0]] for k in (1, 2))
+    )
     assert (normals[:, 2] > 0).all()
 
 

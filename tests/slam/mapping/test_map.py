@@ -34,7 +34,10 @@ def street(position: np.ndarray) -> np.ndarray:
     """A road 1.65 m below y = 0 between walls at x = -6 and x = 6."""
     with np.errstate(divide="ignore"):
         road = np.where(Y > 0, (1.65 - position[1]) / Y, np.inf)
-        left, right = np.where(X < 0, (-6 - position[0]) / X, np.inf), np.where(X > 0, (6 - position[0]) / X, np.inf)
+        left, right = (
+            np.where(X < 0, (-6 - position[0]) / X, np.inf),
+            np.where(X > 0, (6 - position[0]) / X, np.inf),
+        )
     return np.minimum(np.minimum(np.minimum(road, left), right), 90.0).astype(np.float32)
 
 
@@ -46,7 +49,9 @@ def street_map(noise=lambda depth, k: depth, frames: int = 12, **config) -> Tsdf
     tsdf_map = TsdfMap(MappingConfig(**config), CAMERA)
     for k in range(frames):
         T_world_camera = pose(0.0, 0.0, float(k))
-        tsdf_map.integrate(KeyframeDepth(0, noise(street(T_world_camera[:3, 3]), k), None, GREY, T_world_camera))
+        tsdf_map.integrate(
+            KeyframeDepth(0, noise(street(T_world_camera[:3, 3]), k), None, GREY, T_world_camera)
+        )
     return tsdf_map
 
 
@@ -91,7 +96,9 @@ def test_thinned_keyframes_keep_the_geometry(monkeypatch):
     tsdf_map = TsdfMap(MappingConfig(), thinned)
     for k, z in enumerate((0.0, 0.5, 1.0)):
         keyframe = Keyframe.of(Frame(k, float(k), GREY), plate(8.0 - z), spill_file)
-        tsdf_map.integrate(KeyframeDepth(0, keyframe.depth_unscaled, None, keyframe.image, pose(1.0, 0.0, z)))
+        tsdf_map.integrate(
+            KeyframeDepth(0, keyframe.depth_unscaled, None, keyframe.image, pose(1.0, 0.0, z))
+        )
     vertices = tsdf_map.mesh().points
     np.testing.assert_allclose(vertices[:, 2], 8.0, atol=0.003)
     assert abs((vertices[:, 0].min() + vertices[:, 0].max()) / 2 - 1.0) < 0.15
@@ -106,13 +113,18 @@ def test_depth_inconsistent_between_views_is_left_out():
 
     tsdf_map = street_map(ghost)
     assert distance_to_street(tsdf_map.mesh().points).max() < 0.2
-    assert tsdf_map.statistics()["filters"]["agreement"] > street_map().statistics()["filters"]["agreement"] + 0.001
+    assert (
+        tsdf_map.statistics()["filters"]["agreement"]
+        > street_map().statistics()["filters"]["agreement"] + 0.001
+    )
 
 
 def test_flying_pixels_and_far_depth_are_left_out(monkeypatch):
     near_wall = np.where(np.abs(X) < 0.3, 6.0, 14.0).astype(np.float32)
     # a network smears the edge over some pixels
-    smeared = np.stack([np.convolve(row, np.ones(5) / 5, mode="same") for row in near_wall]).astype(np.float32)
+    smeared = np.stack([np.convolve(row, np.ones(5) / 5, mode="same") for row in near_wall]).astype(
+        np.float32
+    )
     smeared[:, :3], smeared[:, -3:] = 14.0, 14.0
     smeared[:8] = 60.0  # sky
 
@@ -184,5 +196,9 @@ def test_a_car_that_comes_towards_the_camera_is_not_fused(monkeypatch):
     monkeypatch.setattr("slam.mapping.depth._MAX_DEPTH_DIFFERENCE", 0.3)
     monkeypatch.setattr(surface, "_LEAST_TRIANGLES", 0)
     street_alone, with_car = street_map(frames=12), street_map(oncoming, frames=12)
-    assert with_car.statistics()["filters"]["moving"] > 0.001 > street_alone.statistics()["filters"]["moving"]
+    assert (
+        with_car.statistics()["filters"]["moving"]
+        > 0.001
+        > street_alone.statistics()["filters"]["moving"]
+    )
     assert ghosts(with_car) < 50

@@ -39,13 +39,20 @@ def test_tiles_are_joined_without_a_seam(street_map, monkeypatch):
     mesh = street_map(voxel_size_m=0.1).mesh()
     vertices, triangles = mesh.points, mesh.triangles
     assert len(np.unique(vertices, axis=0)) == len(vertices)
-    edges = Counter(map(tuple, np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).tolist()))
+    edges = Counter(
+        map(tuple, np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).tolist())
+    )
     assert max(edges.values()) == 2
     open_edges = np.array([edge for edge, count in edges.items() if count == 1])
     middle = vertices[open_edges].mean(axis=1)
     side = TILE_BLOCKS * BLOCK_SIDE * 0.1
     at_border = (np.abs(middle[:, 0]) < 0.2) | (np.abs(middle[:, 2] - side) < 0.2)
-    inside = (middle[:, 1] > 1.4) & (np.abs(middle[:, 0]) < 4) & (middle[:, 2] > 12) & (middle[:, 2] < 30)
+    inside = (
+        (middle[:, 1] > 1.4)
+        & (np.abs(middle[:, 0]) < 4)
+        & (middle[:, 2] > 12)
+        & (middle[:, 2] < 30)
+    )
     assert not (at_border & inside).any()
     x = vertices[triangles][..., 0]
     left, right = triangles[x.min(axis=1) < 0], triangles[x.max(axis=1) > 0]

@@ -43,7 +43,10 @@ def counted(calls: Counter[str], name: str, of: Callable[..., Any]) -> Callable[
 
 
 def test_calls_a_frame(monkeypatch: pytest.MonkeyPatch):
-    sequence, calls = SimulatedSequence(SimulationOptions("grid", FRAMES, 610, 312, 96)), Counter[str]()
+    sequence, calls = (
+        SimulatedSequence(SimulationOptions("grid", FRAMES, 610, 312, 96)),
+        Counter[str](),
+    )
 
     def depth_of(index: int) -> np.ndarray:
         depth = sequence.street.depth(index)
@@ -51,7 +54,10 @@ def test_calls_a_frame(monkeypatch: pytest.MonkeyPatch):
 
     oracle = OraclePredictor(sequence.reference, depth_of, OracleNoise(), 0.2)
     for owner, name in (
-        *((cv2, name) for name in ("calcOpticalFlowPyrLK", "findEssentialMat", "goodFeaturesToTrack")),
+        *(
+            (cv2, name)
+            for name in ("calcOpticalFlowPyrLK", "findEssentialMat", "goodFeaturesToTrack")
+        ),
         (oracle, "depth"),
         (oracle, "snippet"),
         (FeatureExtractor, "view"),
@@ -68,6 +74,8 @@ def test_calls_a_frame(monkeypatch: pytest.MonkeyPatch):
 def test_calls_a_frame_of_a_hand_held_camera(monkeypatch: pytest.MonkeyPatch):
     """Two searches of corners for the frame; for a keyframe, two in each keyframe that still finds some of them."""
     truth, calls = room.walk(40), Counter[str]()
-    monkeypatch.setattr(cv2, "calcOpticalFlowPyrLK", counted(calls, "flow", cv2.calcOpticalFlowPyrLK))
+    monkeypatch.setattr(
+        cv2, "calcOpticalFlowPyrLK", counted(calls, "flow", cv2.calcOpticalFlowPyrLK)
+    )
     keyframes = room.tracked(truth).segments[-1].keyframes
     assert 0 < calls["flow"] <= 2 * len(truth) + 16 * len(keyframes)

@@ -19,13 +19,18 @@ CAMERA = Intrinsics(64, 32, 50.0, 50.0, 31.5, 15.5)
 FRAMES = 6
 
 
-def depths(step: float, guess_sigma: float | None, refined: bool = True) -> Callable[[int], KeyframeDepth]:
+def depths(
+    step: float, guess_sigma: float | None, refined: bool = True
+) -> Callable[[int], KeyframeDepth]:
     """Of a camera that goes sideways by ``step`` a frame before a wall 5 m away."""
     spill_file, rng = SpillFile(), np.random.default_rng(0)
-    frames = [Frame(k, float(k), rng.integers(0, 255, (32, 64, 3), dtype=np.uint8)) for k in range(FRAMES)]
+    frames = [
+        Frame(k, float(k), rng.integers(0, 255, (32, 64, 3), dtype=np.uint8)) for k in range(FRAMES)
+    ]
     wall = np.full((32, 64), 2.5, np.float32)
     drive = Drive(
-        keyframes=[Keyframe.of(frame, wall, spill_file) for frame in frames], roads=[Failed("no road")] * FRAMES
+        keyframes=[Keyframe.of(frame, wall, spill_file) for frame in frames],
+        roads=[Failed("no road")] * FRAMES,
     )
     T_world_camera = np.tile(np.eye(4), (FRAMES, 1, 1))
     T_world_camera[:, 0, 3] = step * np.arange(FRAMES)
@@ -43,7 +48,9 @@ def test_what_no_neighbour_measures_has_the_sigma_of_a_guess() -> None:
 
 
 @pytest.mark.parametrize(("guess_sigma", "refined"), [(None, True), (0.32, False)])
-def test_depth_that_is_not_to_be_measured_has_no_sigma(guess_sigma: float | None, refined: bool) -> None:
+def test_depth_that_is_not_to_be_measured_has_no_sigma(
+    guess_sigma: float | None, refined: bool
+) -> None:
     standing = depths(0.0, guess_sigma, refined)(2)
     assert standing.relative_sigma is None
     np.testing.assert_allclose(standing.depth, 5.0, rtol=1e-6)

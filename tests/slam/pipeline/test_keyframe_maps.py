@@ -20,7 +20,14 @@ from slam.frontend.drive import Drive
 from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.frontend.keyframes.relative_poses import KeyframePoses, chained, keyframe_poses
 from slam.frontend.visual.motion import Motion
-from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert, rotation_angle, umeyama
+from slam.geometry.se3 import (
+    FloatArray,
+    chain,
+    from_rotation_vector,
+    invert,
+    rotation_angle,
+    umeyama,
+)
 from slam.loops.closure import LoopClosures, Track, find_loops
 from slam.loops.recognition import Loop
 from slam.pipeline import keyframe_maps
@@ -36,7 +43,9 @@ def steps(count: int, scatter: float, seconds: float = 0.1) -> Drive:
     rng = np.random.default_rng(0)
     motions = []
     for k in range(count):
-        T = from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]) + rng.normal(0.0, scatter, 3))
+        T = from_rotation_vector(
+            np.zeros(3), np.array([0.0, 0.0, 1.0]) + rng.normal(0.0, scatter, 3)
+        )
         pose = RelativePose(k, k + 1, T, np.ones(6), "essential")
         motions.append(Motion(pose, np.eye(6), seconds=seconds))
     return Drive(motions=motions, roads=[1.0] * count)
@@ -46,7 +55,12 @@ def steps(count: int, scatter: float, seconds: float = 0.1) -> Drive:
     ("count", "scatter", "seconds", "front_end"),
     [
         *((60, 0.02, 0.1, "steps"), (60, 1.0, 0.1, "keyframes"), (60, 0.02, 1.0, "keyframes")),
-        *((12, 0.02, 0.1, "steps"), (12, 1.0, 0.1, "keyframes"), (12, 0.02, 1.0, "both"), (8, 0.02, 0.1, "both")),
+        *(
+            (12, 0.02, 0.1, "steps"),
+            (12, 1.0, 0.1, "keyframes"),
+            (12, 0.02, 1.0, "both"),
+            (8, 0.02, 0.1, "both"),
+        ),
     ],
 )
 def test_a_vehicle_goes_the_same_way_for_a_while_and_fast(
@@ -66,7 +80,9 @@ def test_a_known_camera_height_and_a_setting_choose() -> None:
 
 
 KEYFRAMES_ALONE = SlamConfig(
-    keyframes=KeyframesConfig(use="always"), loops=LoopsConfig(enabled=False), mapping=MappingConfig(enabled=False)
+    keyframes=KeyframesConfig(use="always"),
+    loops=LoopsConfig(enabled=False),
+    mapping=MappingConfig(enabled=False),
 )
 
 
@@ -82,11 +98,15 @@ def test_steps_are_measured_where_keyframes_have_no_pose(stands: bool) -> None:
     if stands:
         truth[34:] = truth[32:38]
     truth[[*repeated]] = truth[31]
-    oracle = OraclePredictor(truth, lambda k: 0.5 * room.depth_map(truth[k]))  # in the unit of its poses
+    oracle = OraclePredictor(
+        truth, lambda k: 0.5 * room.depth_map(truth[k])
+    )  # in the unit of its poses
     with Observer(oracle, room.INTRINSICS, KEYFRAMES_ALONE, Stopwatch()) as observer:
         for k, T in enumerate(truth):
             frame = room.frame(k, T)
-            observer.add(k, Frame(k, frame.stamp, np.zeros_like(frame.image)) if k in blank else frame)
+            observer.add(
+                k, Frame(k, frame.stamp, np.zeros_like(frame.image)) if k in blank else frame
+            )
         drive = completed(observer)
     started = min(drive.map_poses.segments)
     assert started < 10 and len(drive.map_poses.segments) == 40 - len(blank) - started
@@ -96,7 +116,8 @@ def test_steps_are_measured_where_keyframes_have_no_pose(stands: bool) -> None:
 
 
 @pytest.mark.parametrize(
-    "interrupted", [(20, 22), *(pytest.param(frames, marks=pytest.mark.slow) for frames in ((), (19, 21)))]
+    "interrupted",
+    [(20, 22), *(pytest.param(frames, marks=pytest.mark.slow) for frames in ((), (19, 21)))],
 )
 def test_depth_is_predicted_for_keyframes_alone(interrupted: tuple[int, ...]) -> None:
     """The same ones where the observations are asked for in between."""
@@ -115,8 +136,14 @@ def test_depth_is_predicted_for_keyframes_alone(interrupted: tuple[int, ...]) ->
                 observer.measured()
         drive = completed(observer)
     keyframes = drive.maps[-1].keyframes
-    assert all(np.isfinite(keyframe.learned_depth).any() for keyframe in keyframes if keyframe.grey is not None)
-    assert [k for k in predicted if k >= 20] == [keyframe.index for keyframe in keyframes if keyframe.index >= 20]
+    assert all(
+        np.isfinite(keyframe.learned_depth).any()
+        for keyframe in keyframes
+        if keyframe.grey is not None
+    )
+    assert [k for k in predicted if k >= 20] == [
+        keyframe.index for keyframe in keyframes if keyframe.index >= 20
+    ]
     assert [snippet.target for snippet in drive.trusted if snippet.target > 18] == [22, 26, 30, 34]
     assert len(drive.trusted[0].sources) == 4 and not drive.interpolated
 
@@ -130,7 +157,9 @@ def test_opencv_takes_all_cores_for_keyframes_alone(
     truth = room.walk(2)
     oracle, config = OraclePredictor(truth, lambda k: room.depth_map(truth[k])), SlamConfig()
     with opencv_threads(1):
-        with Observer(oracle, room.INTRINSICS, config, Stopwatch(), camera_height_m=camera_height_m):
+        with Observer(
+            oracle, room.INTRINSICS, config, Stopwatch(), camera_height_m=camera_height_m
+        ):
             assert cv2.getNumThreads() == (3 if camera_height_m is None else 1)
         assert cv2.getNumThreads() == 1
 
@@ -224,16 +253,22 @@ def test_maps_before_and_after_a_loss_are_joined_where_the_camera_is_rolled_and_
         assert np.rad2deg(rotation_angle(T[:3, :3].T @ loop.measured.T_from_to[:3, :3])) < 3.0
 
 
-@pytest.mark.filterwarnings("ignore:Mean of empty slice", "ignore:invalid value")  # it has no corners
+@pytest.mark.filterwarnings(
+    "ignore:Mean of empty slice", "ignore:invalid value"
+)  # it has no corners
 @pytest.mark.slow
-def test_maps_are_joined_where_a_loop_within_one_of_them_has_more_inliers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_maps_are_joined_where_a_loop_within_one_of_them_has_more_inliers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The loop within the first map is added by hand, for in this small room the window finds such places itself."""
 
     def find(views: Sequence[View], track: Track, *rest: Any) -> LoopClosures:
         closures = find_loops(views, track, *rest)
         last = int(np.flatnonzero(track.maps == 0)[-1])
         T = invert(track.T_world_camera[0]) @ track.T_world_camera[last]
-        within = RelativePose(int(track.frames[0]), int(track.frames[last]), T, np.full(6, 0.01), LOOP_SOURCE)
+        within = RelativePose(
+            int(track.frames[0]), int(track.frames[last]), T, np.full(6, 0.01), LOOP_SOURCE
+        )
         loop = Loop(within, 1 + max(loop.inliers for loop in closures.accepted), 1.0)
         return replace(closures, accepted=(*closures.accepted, loop))
 
@@ -245,7 +280,9 @@ def test_maps_are_joined_where_a_loop_within_one_of_them_has_more_inliers(monkey
     assert errors(after.poses, truth)[0] < 0.01
 
 
-def tracked(truth: FloatArray, unseen: Sequence[int], sparse: Sequence[int] = ()) -> KeyframeTracking:
+def tracked(
+    truth: FloatArray, unseen: Sequence[int], sparse: Sequence[int] = ()
+) -> KeyframeTracking:
     """After some frames, of which some show another scene, and some have no depth."""
     tracking = KeyframeTracking(KeyframesConfig(use="always"), CONFIG.loops, room.INTRINSICS, 0)
     for k, T in enumerate(truth):
@@ -275,11 +312,21 @@ def test_after_a_short_loss_the_camera_is_found_again_in_its_map() -> None:
 @pytest.mark.parametrize(
     ("places", "unseen", "sparse", "relocalised"),
     [
-        pytest.param([*range(60), *range(82, 89), *range(35, 38)], range(60, 66), (), [66, 67], marks=pytest.mark.slow),
+        pytest.param(
+            [*range(60), *range(82, 89), *range(35, 38)],
+            range(60, 66),
+            (),
+            [66, 67],
+            marks=pytest.mark.slow,
+        ),
         pytest.param([*range(61), 68, 60, 8], (60, 62), (61,), [63], marks=pytest.mark.slow),
         pytest.param([*range(70), 40, 41], range(60, 70), (), [], marks=pytest.mark.slow),
     ],
-    ids=["relocalised before", "located in a frame without depth before", "in a map that has just begun"],
+    ids=[
+        "relocalised before",
+        "located in a frame without depth before",
+        "in a map that has just begun",
+    ],
 )
 def test_a_camera_that_is_lost_again_at_once_is_found_in_the_map_as_it_then_is(
     places: list[int], unseen: Sequence[int], sparse: Sequence[int], relocalised: list[int]

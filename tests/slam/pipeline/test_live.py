@@ -95,8 +95,12 @@ def test_a_frame_gives_the_newest_pose_and_its_state() -> None:
     slam = started(load_config(None, SETTINGS))
     poses = [slam.add_frame(drive().frame(k).image, drive().frame(k).stamp) for k in range(20)]
     assert poses[0].state == "starting" and poses[-1].state == "tracking"
-    assert [pose.frame for pose in poses] == sorted(pose.frame for pose in poses) and poses[-1].frame >= 17
-    np.testing.assert_allclose(poses[-1].T_world_camera, slam.trajectory().T_world_camera[poses[-1].frame], atol=1.0)
+    assert [pose.frame for pose in poses] == sorted(pose.frame for pose in poses) and poses[
+        -1
+    ].frame >= 17
+    np.testing.assert_allclose(
+        poses[-1].T_world_camera, slam.trajectory().T_world_camera[poses[-1].frame], atol=1.0
+    )
 
 
 def test_a_session_gives_its_points_keyframes_marginals_and_surface() -> None:
@@ -107,12 +111,18 @@ def test_a_session_gives_its_points_keyframes_marginals_and_surface() -> None:
     keyframes, points = slam.keyframes(), slam.points()
     assert set(keyframes.stamps) < set(slam.trajectory().stamps) and len(keyframes) == 8
     T_street_first = drive().street.T_world_camera[0]
-    away = drive().street.distance_to_surface(apply(T_street_first, points[:: max(len(points) // 500, 1)]))
+    away = drive().street.distance_to_surface(
+        apply(T_street_first, points[:: max(len(points) // 500, 1)])
+    )
     assert len(points) > 500 and np.median(away) < 1.0
     near, far = (np.sqrt(np.diag(slam.marginals(frame))) for frame in (5, 31))
-    assert (near > 0).all() and (near < far).all() and far[5] < 3.0, "metres ahead, of 31 by learned poses alone"
+    assert (near > 0).all() and (near < far).all() and far[5] < 3.0, (
+        "metres ahead, of 31 by learned poses alone"
+    )
     vertices = np.asarray(slam.surface().vertices)
-    assert np.median(drive().street.distance_to_surface(apply(T_street_first, vertices[::50]))) < 1.0
+    assert (
+        np.median(drive().street.distance_to_surface(apply(T_street_first, vertices[::50]))) < 1.0
+    )
     clouds, poses = slam.clouds(first=10), slam.trajectory().T_world_camera
     assert min(clouds) >= 10 and set(clouds) <= set(range(32))
     for frame, cloud in clouds.items():
@@ -174,12 +184,21 @@ def test_wrong_frames_and_modes_are_refused() -> None:
     with pytest.raises(SlamError, match="camera-height needs a known height; live has none"):
         Slam(oracle(), drive().intrinsics, load_config(None, ["scale.mode=camera-height"]))
     with pytest.raises(SlamError, match="known needs frames of a whole sequence, and live grows"):
-        started(load_config(None, ["scale.mode=known", "scale.known_between=[0,5]", "scale.known_m=3"]))
+        started(
+            load_config(None, ["scale.mode=known", "scale.known_between=[0,5]", "scale.known_m=3"])
+        )
 
 
 @pytest.mark.parametrize(
     "key, value",
-    [("fx", -200.0), ("fx", np.nan), ("cx", 1e6), ("width", 0), ("camera_height_m", 0.0), ("camera_height_m", np.nan)],
+    [
+        ("fx", -200.0),
+        ("fx", np.nan),
+        ("cx", 1e6),
+        ("width", 0),
+        ("camera_height_m", 0.0),
+        ("camera_height_m", np.nan),
+    ],
 )
 def test_an_impossible_camera_is_refused(key: str, value: float) -> None:
     intrinsics, height = drive().intrinsics, {}
@@ -199,7 +218,9 @@ def test_depth_that_is_no_depth_of_the_image_is_refused() -> None:
     predictor = oracle()
     predictor.__class__ = Small
     slam = Slam(predictor, drive().intrinsics, load_config(None, SETTINGS))
-    with pytest.raises(SlamError, match=r"depth of frame 0 must be \(96, 312\) float32; got \(48, 156\)"):
+    with pytest.raises(
+        SlamError, match=r"depth of frame 0 must be \(96, 312\) float32; got \(48, 156\)"
+    ):
         feed(slam, 0, 2)
 
 
@@ -242,7 +263,10 @@ def test_a_frame_whose_measurement_fails_is_a_gap_and_the_session_goes_on(
     gaps = [record.getMessage() for record in caplog.records if "is a gap" in record.getMessage()]
     assert len(gaps) == 1 and "RuntimeError: memory of frame 8 is gone" in gaps[0]
     np.testing.assert_array_equal(trajectory.stamps, drive().stamps[:20])
-    assert trajectory.T_world_camera.shape == (20, 4, 4) and np.isfinite(trajectory.T_world_camera).all()
+    assert (
+        trajectory.T_world_camera.shape == (20, 4, 4)
+        and np.isfinite(trajectory.T_world_camera).all()
+    )
     reference = drive().reference
     assert reference is not None
     assert np.linalg.norm(trajectory.positions[-1]) > 0.5 * np.linalg.norm(reference[19, :3, 3])
@@ -274,4 +298,6 @@ def test_a_buffer_that_is_reused_is_a_new_frame() -> None:
         frame = drive().frame(k)
         buffer[:] = frame.image
         buffered.add_frame(buffer, frame.stamp)
-    np.testing.assert_array_equal(buffered.trajectory().T_world_camera, slam.trajectory().T_world_camera)
+    np.testing.assert_array_equal(
+        buffered.trajectory().T_world_camera, slam.trajectory().T_world_camera
+    )

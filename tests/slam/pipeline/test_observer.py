@@ -42,7 +42,9 @@ def black(sequence: SimulatedSequence, index: int) -> Frame:
 def repeated_as_jpeg(sequence: SimulatedSequence, index: int) -> Frame:
     """A frozen camera in a compressed video: the same image, encoded anew each time."""
     quality = 60 + 3 * (index - BAD[0])
-    _, encoded = cv2.imencode(".jpg", sequence.frame(BAD[0] - 1).image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    _, encoded = cv2.imencode(
+        ".jpg", sequence.frame(BAD[0] - 1).image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality]
+    )
     decoded = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
     assert decoded is not None
     return Frame(index, float(sequence.stamps[index]), np.ascontiguousarray(decoded[..., ::-1]))
@@ -61,7 +63,11 @@ class Damaged:
 
     def __init__(self, sequence: SimulatedSequence, damage: Damage, bad: range) -> None:
         self._sequence, self._damage, self._bad = sequence, damage, bad
-        self.name, self.intrinsics, self.stamps = sequence.name, sequence.intrinsics, sequence.stamps
+        self.name, self.intrinsics, self.stamps = (
+            sequence.name,
+            sequence.intrinsics,
+            sequence.stamps,
+        )
         self.reference, self.camera_height_m = sequence.reference, sequence.camera_height_m
         self.T_camera_lidar = None
 
@@ -69,7 +75,9 @@ class Damaged:
         return len(self._sequence)
 
     def frame(self, index: int) -> Frame:
-        return (self._damage if index in self._bad else SimulatedSequence.frame)(self._sequence, index)
+        return (self._damage if index in self._bad else SimulatedSequence.frame)(
+            self._sequence, index
+        )
 
     def has_scan(self, index: int) -> bool:
         return False
@@ -102,7 +110,9 @@ def oracle_of(sequence: Damaged, rows: Sequence[int] = range(FRAMES)) -> OracleP
         depth = street().street.render(rows[index]).depth
         return np.where(depth > 0, depth, 200.0)
 
-    return OraclePredictor(sequence.reference, depth_of, OracleNoise(np.deg2rad(0.1), 0.03, seed=2), FACTOR)
+    return OraclePredictor(
+        sequence.reference, depth_of, OracleNoise(np.deg2rad(0.1), 0.03, seed=2), FACTOR
+    )
 
 
 def config_with(*overrides: str) -> SlamConfig:
@@ -153,13 +163,19 @@ def test_ten_frames_are_interpolated_and_reported(damage: Damage) -> None:
         np.testing.assert_array_equal(each.T_world_camera[0], np.eye(4))
     seen = result.drive
     assert set(seen.interpolated) == set(BAD)
-    assert warnings.count("are interpolated") == warnings.count("frames 15 to 24 are interpolated") == 1
+    assert (
+        warnings.count("are interpolated")
+        == warnings.count("frames 15 to 24 are interpolated")
+        == 1
+    )
     interpolated = [factor for factor in result.factors if factor.source == INTERPOLATED_SOURCE]
     assert [factor.from_index for factor in interpolated] == list(range(14, 25))
     assert min(factor.sigmas[0] for factor in interpolated) > 5 * np.deg2rad(0.3)
     # the gap is ten metres of forty; standing still through it would cost more than a metre
     assert ate(result) < 0.6
-    assert (result.map is not None) == (damage is black) and not {k.index for k in seen.keyframes} & set(BAD)
+    assert (result.map is not None) == (damage is black) and not {
+        k.index for k in seen.keyframes
+    } & set(BAD)
     assert not {view.index for view in seen.views} & set(BAD)
 
 
@@ -174,11 +190,15 @@ def test_doubled_frames_are_counted_and_cost_nothing() -> None:
 
     class Doubled(Damaged):
         def frame(self, index: int) -> Frame:
-            return replace(street().frame(rows[index]), index=index, stamp=float(street().stamps[index]))
+            return replace(
+                street().frame(rows[index]), index=index, stamp=float(street().stamps[index])
+            )
 
     sequence = Doubled(street(), black, range(0))
     sequence.reference = street().reference[rows]
-    result = SlamPipeline(sequence, oracle_of(sequence, rows), config_with("mapping.enabled=false")).run()
+    result = SlamPipeline(
+        sequence, oracle_of(sequence, rows), config_with("mapping.enabled=false")
+    ).run()
     assert result.drive.doubled == [13, 27]
     assert result.drive.interpolated == {} and ate(result) < 0.6
 
@@ -242,7 +262,8 @@ def test_flushing_after_each_frame_measures_the_same_as_going_on(stride: int) ->
     sequence = Damaged(street(), black, range(12, 14))
     config = config_with("mapping.enabled=false", f"depth.frame_stride={stride}")
     going_on, flushed = (
-        Observer(oracle_of(sequence), sequence.intrinsics, config, Stopwatch()) for _ in ("going on", "flushed")
+        Observer(oracle_of(sequence), sequence.intrinsics, config, Stopwatch())
+        for _ in ("going on", "flushed")
     )
     with going_on, flushed:
         for index in range(20):
@@ -259,7 +280,9 @@ def assert_same(one: Observer, other: Observer) -> None:
     one.flush()
     other.flush()
     first, second = one.drive, other.drive
-    assert len(first.relative_rotations) > 10 and len(first.road_steps) > 5 and len(first.steps) > 12
+    assert (
+        len(first.relative_rotations) > 10 and len(first.road_steps) > 5 and len(first.steps) > 12
+    )
     assert first.road_steps.keys() == second.road_steps.keys()
     for measured in (
         lambda o: [rotation.R_to_from for rotation in o.relative_rotations],
@@ -272,7 +295,9 @@ def assert_same(one: Observer, other: Observer) -> None:
     ):
         np.testing.assert_array_equal(measured(first), measured(second))
     assert first.steps.keys() == second.steps.keys()
-    assert [snippet.target for snippet in first.snippets] == [snippet.target for snippet in second.snippets]
+    assert [snippet.target for snippet in first.snippets] == [
+        snippet.target for snippet in second.snippets
+    ]
     assert [view.index for view in first.views] == [view.index for view in second.views]
     assert first.unusable == second.unusable and first.failures == second.failures
 
@@ -283,5 +308,8 @@ def test_the_threads_of_an_observer_end_with_it() -> None:
     with Observer(oracle_of(sequence), sequence.intrinsics, config_with(), Stopwatch()) as observer:
         for index in range(8):
             observer.add(index, sequence.frame(index))
-        assert {thread.name for thread in set(threading.enumerate()) - before} == {"oracle_0", "beside_0"}
+        assert {thread.name for thread in set(threading.enumerate()) - before} == {
+            "oracle_0",
+            "beside_0",
+        }
     assert set(threading.enumerate()) <= before

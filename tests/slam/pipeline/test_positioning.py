@@ -19,10 +19,17 @@ from slam.sequences.recording import RecordedSequence
 FRAMES = 200
 CAMERA = Intrinsics(width=104, height=32, fx=60.0, fy=60.0, cx=51.5, cy=12.0)
 PLACE = np.array([49.0110, 8.4160, 115.0])
-SETTINGS = ["visual_odometry.enabled=false", "mapping.enabled=false", "gaps.enabled=false", "loops.enabled=false"]
+SETTINGS = [
+    "visual_odometry.enabled=false",
+    "mapping.enabled=false",
+    "gaps.enabled=false",
+    "loops.enabled=false",
+]
 SETTINGS += ["keyframes.use=never"]
 # the first camera looks east: its x axis points south, its y axis down
-T_ENU_WORLD = se3.make(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([5.0, -3.0, 1.0]))
+T_ENU_WORLD = se3.make(
+    np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([5.0, -3.0, 1.0])
+)
 
 
 class Grey:
@@ -39,7 +46,9 @@ def path() -> FloatArray:
     k = np.arange(FRAMES - 1)
     yaw = 0.03 * np.sin(k / 19.0)
     return se3.chain(
-        se3.from_rotation_vector(np.stack([0 * yaw, yaw, 0 * yaw], 1), np.tile([0.0, 0.0, 1.0], (len(k), 1)))
+        se3.from_rotation_vector(
+            np.stack([0 * yaw, yaw, 0 * yaw], 1), np.tile([0.0, 0.0, 1.0], (len(k), 1))
+        )
     )
 
 
@@ -56,7 +65,9 @@ def track(rng: np.random.Generator, sigma_m: float, outliers: int = 0) -> GpsTra
     """Fixes four times a second between the frames."""
     stamps = np.arange(0.03, 19.9, 0.25)
     positions = se3.apply(T_ENU_WORLD, path()[:, :3, 3])
-    points = np.column_stack([np.interp(stamps, 0.1 * np.arange(FRAMES), positions[:, axis]) for axis in range(3)])
+    points = np.column_stack(
+        [np.interp(stamps, 0.1 * np.arange(FRAMES), positions[:, axis]) for axis in range(3)]
+    )
     points += rng.normal(scale=sigma_m, size=points.shape)
     points[rng.choice(len(points), outliers, replace=False)] += [60.0, 40.0, 0.0]
     return GpsTrack(stamps, LocalFrame(PLACE).places(points), np.ones(len(stamps)))
@@ -64,7 +75,9 @@ def track(rng: np.random.Generator, sigma_m: float, outliers: int = 0) -> GpsTra
 
 def run(gps: GpsTrack | None, *overrides: str, noise: OracleNoise | None = None) -> Estimate:
     oracle = OraclePredictor(path(), depth, noise or OracleNoise(), 0.2)
-    return SlamPipeline(drive(), oracle, load_config(None, [*SETTINGS, *overrides]), gps_track=gps).run()
+    return SlamPipeline(
+        drive(), oracle, load_config(None, [*SETTINGS, *overrides]), gps_track=gps
+    ).run()
 
 
 def worst(result: Estimate) -> float:
@@ -73,13 +86,22 @@ def worst(result: Estimate) -> float:
 
 
 def test_exact_fixes_give_scale_and_place() -> None:
-    result = run(track(np.random.default_rng(0), 0.0), "gps.sigma_m=0.1", "gps.vertical_sigma_m=0.1")
+    result = run(
+        track(np.random.default_rng(0), 0.0), "gps.sigma_m=0.1", "gps.vertical_sigma_m=0.1"
+    )
     assert result.scale.mode == "gps" and worst(result) < 0.1
     location = result.location
     assert isinstance(location, Location)
-    places = location.fixes.frame.places((location.T_enu_world @ result.optimised.T_world_camera)[:, :3, 3])
+    places = location.fixes.frame.places(
+        (location.T_enu_world @ result.optimised.T_world_camera)[:, :3, 3]
+    )
     true = LocalFrame(PLACE).places(se3.apply(T_ENU_WORLD, path()[:, :3, 3]))
-    assert np.linalg.norm(LocalFrame(PLACE).points(places) - LocalFrame(PLACE).points(true), axis=1).max() < 0.1
+    assert (
+        np.linalg.norm(
+            LocalFrame(PLACE).points(places) - LocalFrame(PLACE).points(true), axis=1
+        ).max()
+        < 0.1
+    )
 
 
 @pytest.mark.parametrize("correlation_s", [0, pytest.param(10, marks=pytest.mark.slow)])
@@ -87,10 +109,14 @@ def test_gps_holds_a_drifting_odometry_despite_outliers(correlation_s: int) -> N
     noise = OracleNoise(np.deg2rad(0.3), 0.05, seed=1)
     gps = track(np.random.default_rng(1), 0.5, outliers=8)
     settings = ("gps.sigma_m=0.5", "gps.vertical_sigma_m=0.5", f"gps.correlation_s={correlation_s}")
-    beside, within = (run(gps, *settings, f"gps.factors={use}", noise=noise) for use in ("false", "true"))
+    beside, within = (
+        run(gps, *settings, f"gps.factors={use}", noise=noise) for use in ("false", "true")
+    )
     assert beside.scale.estimate == within.scale.estimate
     positions = [r.location.T_enu_world @ r.optimised.T_world_camera for r in (beside, within)]
-    frame = within.location.fixes.frame.points(LocalFrame(PLACE).places(se3.apply(T_ENU_WORLD, path()[:, :3, 3])))
+    frame = within.location.fixes.frame.points(
+        LocalFrame(PLACE).places(se3.apply(T_ENU_WORLD, path()[:, :3, 3]))
+    )
     errors = [float(np.linalg.norm(T[:, :3, 3] - frame, axis=1).mean()) for T in positions]
     assert errors[1] < 0.45 and 2 * errors[1] < errors[0]
 
@@ -106,7 +132,9 @@ def test_a_track_that_does_not_fit_is_refused() -> None:
 
 
 @pytest.mark.parametrize("change", ["backwards", pytest.param("late", marks=pytest.mark.slow)])
-def test_fixes_of_another_drive_are_left_out_or_refused(change: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_fixes_of_another_drive_are_left_out_or_refused(
+    change: str, caplog: pytest.LogCaptureFixture
+) -> None:
     gps = track(np.random.default_rng(0), 0.0)
     places = gps.places[::-1] if change == "backwards" else np.roll(gps.places, 30, axis=0)
     other = GpsTrack(gps.stamps, places, gps.dilution)
@@ -126,7 +154,9 @@ def test_a_camera_that_stands_is_not_located() -> None:
     assert isinstance(result.scale.estimate, Failed)
 
 
-def test_fixes_in_metres_are_no_factors_of_lengths_that_are_not(caplog: pytest.LogCaptureFixture) -> None:
+def test_fixes_in_metres_are_no_factors_of_lengths_that_are_not(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     """Long enough for the heading, too short for the scale."""
     gps = track(np.random.default_rng(0), 0.0)
     result = run(gps, "gps.sigma_m=5", "gps.correlation_s=0")
@@ -145,7 +175,11 @@ def test_a_known_distance_gives_metres(ends: str) -> None:
 
 @pytest.mark.parametrize(
     ("setting", "said"),
-    [("[20,200]", "names 200, but the drive has frames 0 to 199"), ("[5,5]", "twice"), ("[30s,5]", "names 30s")],
+    [
+        ("[20,200]", "names 200, but the drive has frames 0 to 199"),
+        ("[5,5]", "twice"),
+        ("[30s,5]", "names 30s"),
+    ],
 )
 def test_a_distance_between_frames_that_are_not_there(setting: str, said: str) -> None:
     with pytest.raises(SlamError, match=said):

@@ -83,7 +83,9 @@ def road(index: int) -> FloatArray:
     return np.repeat(depth[:, None], 104, axis=1)
 
 
-def run(drive: LevelRoad, *overrides: str, noise: OracleNoise = NO_NOISE, depth_of=road) -> Estimate:
+def run(
+    drive: LevelRoad, *overrides: str, noise: OracleNoise = NO_NOISE, depth_of=road
+) -> Estimate:
     assert drive.reference is not None
     oracle = OraclePredictor(drive.reference, depth_of, noise, FACTOR)
     return SlamPipeline(drive, oracle, load_config(None, [*NO_IMAGES, *overrides])).run()
@@ -114,7 +116,11 @@ class OneBadSnippet(OraclePredictor):
 
     def snippet(self, frames: list[Frame]) -> SnippetPoses:
         found = super().snippet(frames)
-        return replace(found, T_source_target=np.nan * found.T_source_target) if found.target == 20 else found
+        return (
+            replace(found, T_source_target=np.nan * found.T_source_target)
+            if found.target == 20
+            else found
+        )
 
 
 def test_a_pose_that_is_no_number_costs_a_gap() -> None:
@@ -127,7 +133,9 @@ def test_a_pose_that_is_no_number_costs_a_gap() -> None:
 
 
 @pytest.mark.parametrize("stage", ["close_loops", "PoseGraph"])
-def test_an_error_in_loops_or_graph_costs_these(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_in_loops_or_graph_costs_these(
+    stage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def failing(*_: object) -> None:
         raise KeyError(7)
 
@@ -137,11 +145,16 @@ def test_an_error_in_loops_or_graph_costs_these(stage: str, monkeypatch: pytest.
 
     drive, kept = LevelRoad(turning(30)), []
     assert drive.reference is not None
-    pipeline = SlamPipeline(drive, OraclePredictor(drive.reference, road), load_config(None, NO_IMAGES))
+    pipeline = SlamPipeline(
+        drive, OraclePredictor(drive.reference, road), load_config(None, NO_IMAGES)
+    )
     monkeypatch.setattr(f"slam.pipeline.run.{stage}", failing)
     result = pipeline.run(Keeping())
     assert kept == [("reference", 30), ("network", 30), ("odometry", 30)]
-    assert result.loops.not_sought is not None and "KeyError: 7 (test_run.py:" in result.loops.not_sought
+    assert (
+        result.loops.not_sought is not None
+        and "KeyError: 7 (test_run.py:" in result.loops.not_sought
+    )
     assert isinstance(result.graph, Failed) == (stage == "PoseGraph")
     assert ate(result.optimised, result.reference) < 1e-3
     monkeypatch.setenv(SHOW_TRACEBACK, "1")
@@ -163,7 +176,8 @@ def turning_length(frames: int) -> float:
 
 
 @pytest.mark.parametrize(
-    ("mode", "unit_m"), [("none", HEIGHT_M), ("camera-height", 1.0), ("reference", 1.0), ("auto", 1.0)]
+    ("mode", "unit_m"),
+    [("none", HEIGHT_M), ("camera-height", 1.0), ("reference", 1.0), ("auto", 1.0)],
 )
 def test_scale_modes(mode: str, unit_m: float) -> None:
     """``none`` measures in camera heights, the others in metres."""
@@ -184,7 +198,9 @@ def test_scale_modes(mode: str, unit_m: float) -> None:
         (30, "scale.mode=camera-height", "give a camera.yaml with camera_height_m"),
     ],
 )
-def test_what_cannot_work_is_refused_before_any_frame_is_read(frames: int, setting: str, words: str) -> None:
+def test_what_cannot_work_is_refused_before_any_frame_is_read(
+    frames: int, setting: str, words: str
+) -> None:
     drive = LevelRoad(turning(frames))
     oracle = OraclePredictor(turning(frames), road)
     drive.reference = drive.camera_height_m = None
@@ -199,8 +215,12 @@ def test_what_cannot_work_is_refused_before_any_frame_is_read(frames: int, setti
 def test_lidar_factors_need_metres() -> None:
     drive = LevelRoad(turning(30))
     drive.camera_height_m, drive.T_camera_lidar = None, np.eye(4)
-    pipeline = SlamPipeline(drive, OraclePredictor(turning(30), road), load_config(None, ["lidar.factors=true"]))
-    with pytest.raises(SlamError, match=r"lidar\.factors=true is in metres.*choose scale\.mode=lidar"):
+    pipeline = SlamPipeline(
+        drive, OraclePredictor(turning(30), road), load_config(None, ["lidar.factors=true"])
+    )
+    with pytest.raises(
+        SlamError, match=r"lidar\.factors=true is in metres.*choose scale\.mode=lidar"
+    ):
         pipeline.require_possible()
 
 
@@ -248,7 +268,10 @@ def test_a_standing_camera_stays_at_the_origin(mode: str) -> None:
     result = run(still, f"scale.mode={mode}")
     np.testing.assert_allclose(result.optimised.T_world_camera, still.reference, atol=1e-9)
     if mode == "reference":
-        assert isinstance(result.scale.estimate, Failed) and "does not move" in result.scale.estimate.reason
+        assert (
+            isinstance(result.scale.estimate, Failed)
+            and "does not move" in result.scale.estimate.reason
+        )
 
 
 def test_zero_optical_flow_suppresses_the_noise_of_the_pose_network() -> None:
@@ -257,7 +280,10 @@ def test_zero_optical_flow_suppresses_the_noise_of_the_pose_network() -> None:
     options = ("visual_odometry.enabled=true",)
     result = run(still, *options, noise=noise)
     assert {motion.relative_pose.source for motion in result.drive.motions} == {STILL_SOURCE}
-    rotation = [se3.rotation_angle(t.T_world_camera[:, :3, :3]).max() for t in (result.network, result.optimised)]
+    rotation = [
+        se3.rotation_angle(t.T_world_camera[:, :3, :3]).max()
+        for t in (result.network, result.optimised)
+    ]
     assert rotation[1] < 0.3 * rotation[0]
     np.testing.assert_array_equal(result.odometry.T_world_camera, still.reference)
 
@@ -281,7 +307,11 @@ def street() -> SimulatedSequence:
 
 
 def drive_street(
-    street: SimulatedSequence, progress: Progress = silent, mode: str = "auto", sky: float = 200.0, stride: int = 2
+    street: SimulatedSequence,
+    progress: Progress = silent,
+    mode: str = "auto",
+    sky: float = 200.0,
+    stride: int = 2,
 ) -> Estimate:
     oracle = OraclePredictor(
         street.reference,
@@ -318,7 +348,9 @@ def test_two_runs_write_the_same_bytes(
         assert path.read_bytes() == (tmp_path / "second" / path.name).read_bytes(), path.name
 
 
-def test_images_reach_geometry_map_and_report(driven: tuple[Estimate, list[tuple[str, int, int]]]) -> None:
+def test_images_reach_geometry_map_and_report(
+    driven: tuple[Estimate, list[tuple[str, int, int]]],
+) -> None:
     result, calls = driven
     solved = [("loops and graph", k, 1) for k in range(2)]
     assert calls == [("frames", k, STREET) for k in range(1, STREET + 1)] + solved + [
@@ -326,10 +358,16 @@ def test_images_reach_geometry_map_and_report(driven: tuple[Estimate, list[tuple
     ]
     seen = result.drive
     assert len(seen.steps) > 15 and len(seen.steps) + len(seen.failures) == STREET - 1
-    assert {f.ends for f in result.factors if f.source == "network"} == {(k, k + 1) for k in range(STREET - 1)}
-    assert len(seen.road_steps) > 10 and result.scale.lengths.keys() == triangulated(seen.steps).keys()
+    assert {f.ends for f in result.factors if f.source == "network"} == {
+        (k, k + 1) for k in range(STREET - 1)
+    }
+    assert (
+        len(seen.road_steps) > 10 and result.scale.lengths.keys() == triangulated(seen.steps).keys()
+    )
     assert result.map is not None and result.map.statistics()["triangles"] > 5000
-    assert {"read", "depth network", "pose network", "geometry", "graph", "map"} <= set(result.stopwatch.stages)
+    assert {"read", "depth network", "pose network", "geometry", "graph", "map"} <= set(
+        result.stopwatch.stages
+    )
 
 
 @pytest.mark.slow
@@ -343,9 +381,13 @@ def test_without_metres_the_map_is_as_fine_as_the_scene_is_near(street: Simulate
     assert result.map.statistics()["triangles"] > 5000
 
 
-def test_depth_is_thinned_for_the_map(street: SimulatedSequence, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_depth_is_thinned_for_the_map(
+    street: SimulatedSequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(drive, "MAP_WIDTH_PX", 104)
     oracle = OraclePredictor(street.reference, lambda k: np.full((64, 208), 10.0))
     settings = load_config(None, ["visual_odometry.enabled=false"])
     seen = SlamPipeline(street, oracle, settings).run().drive
-    assert seen.keyframes[0].image.shape == (32, 104, 3) and seen.keyframes[0].depth_unscaled.shape == (32, 104)
+    assert seen.keyframes[0].image.shape == (32, 104, 3) and seen.keyframes[
+        0
+    ].depth_unscaled.shape == (32, 104)

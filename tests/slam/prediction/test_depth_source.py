@@ -20,18 +20,30 @@ from onnx import TensorProto, helper
 
 from slam.config.sections import DepthConfig
 from slam.frames import DepthMap, Frame, Image, Predictor, SnippetPoses
-from slam.prediction.depth_source import DepthFolder, Disparity, FrameNumbers, OnnxDepth, SourcedPredictor, at_size
+from slam.prediction.depth_source import (
+    DepthFolder,
+    Disparity,
+    FrameNumbers,
+    OnnxDepth,
+    SourcedPredictor,
+    at_size,
+)
 from slam.runtime.errors import SlamError
 
 HEIGHT, WIDTH = 40, 96
 # disparity of a road below a far wall, in the networks' unit
-SCENE = np.tile(np.maximum(np.linspace(-0.4, 1.0, HEIGHT), 0.05)[:, None], (1, WIDTH)).astype(np.float32)
+SCENE = np.tile(np.maximum(np.linspace(-0.4, 1.0, HEIGHT), 0.05)[:, None], (1, WIDTH)).astype(
+    np.float32
+)
 MakeNetwork = Callable[..., Path]
 PLAIN: dict[str, Any] = {"kind": "depth", "mean": (0.0, 0.0, 0.0), "std": (1.0, 1.0, 1.0)}
 
 
 def frames(first: int = 0, count: int = 5) -> list[Frame]:
-    return [Frame(k, 0.1 * k, np.zeros((HEIGHT, WIDTH, 3), np.uint8)) for k in range(first, first + count)]
+    return [
+        Frame(k, 0.1 * k, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+        for k in range(first, first + count)
+    ]
 
 
 class Networks:
@@ -57,7 +69,9 @@ class Source:
 
     name, sha256 = "npy:depth", "9f"
 
-    def __init__(self, gain: float = 1.0, shift: float = 0.0, unknown: tuple[int, ...] = ()) -> None:
+    def __init__(
+        self, gain: float = 1.0, shift: float = 0.0, unknown: tuple[int, ...] = ()
+    ) -> None:
         self._gain, self._shift, self._unknown = gain, shift, unknown
 
     def disparity(self, frame: Frame) -> Disparity:
@@ -84,7 +98,9 @@ def test_poses_get_the_unit_of_a_source_with_one_unit(gain: float) -> None:
 
 
 @pytest.mark.parametrize(("align", "shift"), [("scale", 0.0), ("affine", 0.3), ("affine", -0.04)])
-def test_each_frame_is_aligned_to_the_networks(align: Literal["scale", "affine"], shift: float) -> None:
+def test_each_frame_is_aligned_to_the_networks(
+    align: Literal["scale", "affine"], shift: float
+) -> None:
     both = predictor(Source(7.0, shift), align)
     np.testing.assert_allclose(both.depth(frames()[0]), 1 / SCENE, rtol=1e-3)
     np.testing.assert_array_equal(shifts(both.snippet(frames())), 1.0)
@@ -97,7 +113,9 @@ def test_an_alignment_that_would_turn_near_into_far_is_a_scale() -> None:
     assert known.all() and (depth > 0).all() and depth[0, 0] < depth[-1, 0]
 
 
-def test_the_unit_of_a_frame_without_depth_is_that_of_the_nearest(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_unit_of_a_frame_without_depth_is_that_of_the_nearest(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     both = predictor(Source(0.5, unknown=(1, 2, 3)))
     with caplog.at_level(logging.WARNING):
         assert np.isnan(both.depth(frames()[2])).all()
@@ -107,7 +125,9 @@ def test_the_unit_of_a_frame_without_depth_is_that_of_the_nearest(caplog: pytest
 
 
 @pytest.mark.parametrize("size", [(HEIGHT, WIDTH), (10, 24), (80, 192), (20, 190)])
-def test_depth_of_any_size_is_resized_and_unknown_pixels_do_not_spread(size: tuple[int, int]) -> None:
+def test_depth_of_any_size_is_resized_and_unknown_pixels_do_not_spread(
+    size: tuple[int, int],
+) -> None:
     rows = (np.arange(size[0]) + 0.5) / size[0]
     plane = np.tile((0.1 + 0.9 * rows)[:, None], (1, size[1])).astype(np.float32)
     wanted = np.tile((0.1 + 0.9 * (np.arange(HEIGHT) + 0.5) / HEIGHT)[:, None], (1, WIDTH))
@@ -115,7 +135,9 @@ def test_depth_of_any_size_is_resized_and_unknown_pixels_do_not_spread(size: tup
     np.testing.assert_allclose(dense[4:-4], wanted[4:-4], rtol=0.02)
     plane[:, : size[1] // 2] = np.nan
     half = at_size(plane, HEIGHT, WIDTH)
-    np.testing.assert_allclose(half[4:-4, WIDTH // 2 + 6 :], wanted[4:-4, WIDTH // 2 + 6 :], rtol=0.02)
+    np.testing.assert_allclose(
+        half[4:-4, WIDTH // 2 + 6 :], wanted[4:-4, WIDTH // 2 + 6 :], rtol=0.02
+    )
     assert np.isnan(half[:, : WIDTH // 2 - 6]).all() and half.dtype == np.float32
 
 
@@ -151,7 +173,9 @@ def test_files_belong_to_frames_in_the_order_of_their_numbers(tmp_path: Path, fi
 def test_a_range_of_frames_takes_its_own_files_of_the_whole_sequence(tmp_path: Path) -> None:
     folder = folder_of(tmp_path, [f"{k:06d}.npy" for k in range(10)])
     assert metres(opened(folder, FrameNumbers(4, 5, 10)), 0) == pytest.approx(6)
-    assert metres(opened(folder, FrameNumbers(10, 300, 400)), 0) == pytest.approx(1), "a folder of this range alone"
+    assert metres(opened(folder, FrameNumbers(10, 300, 400)), 0) == pytest.approx(1), (
+        "a folder of this range alone"
+    )
 
 
 def test_a_missing_number_is_an_error_only_if_its_frame_is_there(tmp_path: Path) -> None:
@@ -165,19 +189,32 @@ def test_a_missing_number_is_an_error_only_if_its_frame_is_there(tmp_path: Path)
 
 
 @pytest.mark.parametrize(("scale", "value"), [(256.0, 10.0), (1000.0, 2.56)])
-def test_pictures_of_16_bits_have_a_scale_and_zero_is_unknown(tmp_path: Path, scale: float, value: float) -> None:
+def test_pictures_of_16_bits_have_a_scale_and_zero_is_unknown(
+    tmp_path: Path, scale: float, value: float
+) -> None:
     picture = np.full((HEIGHT, WIDTH), 2560, np.uint16)
     picture[0, 0] = 0
     cv2.imwrite(str(tmp_path / "000000.png"), picture)
     disparity = opened(tmp_path, FrameNumbers(1, 0, 1), "png", png_scale=scale).disparity(frame(0))
-    assert disparity is not None and np.isnan(disparity[0, 0]) and disparity[5, 5] == pytest.approx(1 / value)
+    assert (
+        disparity is not None
+        and np.isnan(disparity[0, 0])
+        and disparity[5, 5] == pytest.approx(1 / value)
+    )
 
 
 def test_disparity_may_be_given_and_axes_of_length_one_do_not_matter(tmp_path: Path) -> None:
     np.save(tmp_path / "0.npy", np.full((1, HEIGHT, WIDTH, 1), 0.125, np.float16))
-    source = DepthFolder(DepthConfig(source=f"npy:{tmp_path}", kind="disparity"), FrameNumbers(1, 0, 1), WIDTH, HEIGHT)
+    source = DepthFolder(
+        DepthConfig(source=f"npy:{tmp_path}", kind="disparity"),
+        FrameNumbers(1, 0, 1),
+        WIDTH,
+        HEIGHT,
+    )
     disparity = source.disparity(frame(0))
-    assert disparity is not None and disparity.shape == (HEIGHT, WIDTH) and (disparity == 0.125).all()
+    assert (
+        disparity is not None and disparity.shape == (HEIGHT, WIDTH) and (disparity == 0.125).all()
+    )
 
 
 def test_the_digest_is_of_names_and_content(tmp_path: Path) -> None:
@@ -203,7 +240,9 @@ def make_network(tmp_path: Path) -> MakeNetwork:
         operator: str = "ReduceMean",
     ) -> Path:
         domain = "" if operator == "ReduceMean" else "strange.operators"
-        arguments = {"axes": [shape.index(3) if 3 in shape else 1], "keepdims": 1} if not domain else {}
+        arguments = (
+            {"axes": [shape.index(3) if 3 in shape else 1], "keepdims": 1} if not domain else {}
+        )
         nodes = [helper.make_node(operator, ["image"], ["mean"], domain=domain, **arguments)]
         constants = []
         for word, number in (("gain", gain), ("shift", shift)):
@@ -214,9 +253,15 @@ def make_network(tmp_path: Path) -> MakeNetwork:
         if outputs == 2:
             results.append(helper.make_tensor_value_info("scaled", kind, None))
         graph = helper.make_graph(
-            nodes, "tiny", [helper.make_tensor_value_info("image", kind, list(shape))], results, constants
+            nodes,
+            "tiny",
+            [helper.make_tensor_value_info("image", kind, list(shape))],
+            results,
+            constants,
         )
-        imports = [helper.make_opsetid("", 17)] + ([helper.make_opsetid(domain, 1)] if domain else [])
+        imports = [helper.make_opsetid("", 17)] + (
+            [helper.make_opsetid(domain, 1)] if domain else []
+        )
         path = tmp_path / name
         onnx.save(helper.make_model(graph, opset_imports=imports, ir_version=8), path)
         return path
@@ -239,7 +284,9 @@ def test_mean_and_deviation_of_each_channel(make_network: MakeNetwork) -> None:
     np.testing.assert_allclose(source.infer(np.tile(pixel, (16, 32, 1))), wanted, rtol=1e-5)
 
 
-def test_depth_and_disparity_are_told_apart_and_unknown_pixels_stay_unknown(make_network: MakeNetwork) -> None:
+def test_depth_and_disparity_are_told_apart_and_unknown_pixels_stay_unknown(
+    make_network: MakeNetwork,
+) -> None:
     frame = Frame(0, 0.0, np.concatenate([image(0), image(255)], axis=1)[:, ::2].copy())
     path = make_network(gain=2.0)
     far, near = opened_onnx(path, kind="disparity").disparity(frame)[0, [0, -1]]
@@ -270,8 +317,13 @@ def test_a_network_that_fails_or_gives_no_map_is_found_at_once(make_network: Mak
 def test_the_size_is_that_of_the_file_or_is_set(make_network: MakeNetwork) -> None:
     with pytest.raises(SlamError, match=r"any size: set depth\.size=\[HEIGHT,WIDTH\]"):
         opened_onnx(make_network(shape=(1, 3, "height", "width")))
-    assert opened_onnx(make_network(), size=(16, 32)).disparity(Frame(0, 0.0, image())).shape == (16, 32)
-    with pytest.raises(SlamError, match=r"height and width \[16, 32\], not \[14, 28\]: leave depth\.size out"):
+    assert opened_onnx(make_network(), size=(16, 32)).disparity(Frame(0, 0.0, image())).shape == (
+        16,
+        32,
+    )
+    with pytest.raises(
+        SlamError, match=r"height and width \[16, 32\], not \[14, 28\]: leave depth\.size out"
+    ):
         opened_onnx(make_network(), size=(14, 28))
 
 
@@ -280,6 +332,14 @@ def test_weights_in_other_files_are_refused(make_network: MakeNetwork, tmp_path:
     for tensor in model.graph.initializer:
         tensor.raw_data = np.float32(1).tobytes()
         tensor.ClearField("float_data")
-    onnx.save(model, tmp_path / "split.onnx", save_as_external_data=True, location="weights.bin", size_threshold=0)
-    with pytest.raises(SlamError, match="weights in other files, which are not read: save it as one file"):
+    onnx.save(
+        model,
+        tmp_path / "split.onnx",
+        save_as_external_data=True,
+        location="weights.bin",
+        size_threshold=0,
+    )
+    with pytest.raises(
+        SlamError, match="weights in other files, which are not read: save it as one file"
+    ):
         opened_onnx(tmp_path / "split.onnx")

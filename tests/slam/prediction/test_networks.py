@@ -22,7 +22,10 @@ def direct(tiny_weights: Path) -> DepthPosePredictor:
 
 def frames(first: int, count: int = 5) -> list[Frame]:
     rng = np.random.default_rng(first)
-    return [Frame(k, 0.1 * k, rng.integers(0, 255, (48, 160, 3), np.uint8)) for k in range(first, first + count)]
+    return [
+        Frame(k, 0.1 * k, rng.integers(0, 255, (48, 160, 3), np.uint8))
+        for k in range(first, first + count)
+    ]
 
 
 def test_outputs_by_frame_are_those_of_the_networks_by_image(direct: DepthPosePredictor) -> None:
@@ -33,7 +36,9 @@ def test_outputs_by_frame_are_those_of_the_networks_by_image(direct: DepthPosePr
     np.testing.assert_array_equal(depth, direct.depth(snippet[0].image))
     poses = predictor.snippet(snippet)
     assert (poses.target, poses.sources) == (12, (10, 11, 13, 14))
-    np.testing.assert_array_equal(poses.T_source_target, direct.poses([frame.image for frame in snippet]))
+    np.testing.assert_array_equal(
+        poses.T_source_target, direct.poses([frame.image for frame in snippet])
+    )
 
 
 def test_depth_and_preparation_are_computed_once_a_frame(direct: DepthPosePredictor) -> None:

@@ -25,7 +25,10 @@ def plain() -> Ply:
     colours = np.where(light, [[0.8, 0.8, 0.7]], [[0.2, 0.3, 0.2]])
     colours[rim.ravel()] = [0.9, 0.1, 0.1]
     corner = np.arange(x.size).reshape(x.shape)
-    a, b, c, d = (part.ravel() for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, :-1], corner[1:, 1:]))
+    a, b, c, d = (
+        part.ravel()
+        for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, :-1], corner[1:, 1:])
+    )
     triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([b, d, c], axis=1)])
     return coloured_ply(points, np.tile([0.0, -1.0, 0.0], (len(points), 1)), colours, triangles)
 

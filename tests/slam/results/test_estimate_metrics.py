@@ -65,7 +65,9 @@ def on_disk(embedded: SimulatedSequence, tmp_path_factory: pytest.TempPathFactor
 def true_map(embedded: SimulatedSequence) -> FloatArray:
     """True depth at true poses, as far as 20 m."""
     camera, points = embedded.intrinsics, []
-    for k, T_world_camera in enumerate(embedded.reference if embedded.reference is not None else ()):
+    for k, T_world_camera in enumerate(
+        embedded.reference if embedded.reference is not None else ()
+    ):
         depth = embedded.true_depth(k)
         seen = (camera.rays(camera.pixel_grid()) * depth[..., None])[(depth > 0) & (depth < 20)]
         points.append(apply(T_world_camera, seen[::3]))
@@ -84,7 +86,9 @@ def errors(
         optimised=SimpleNamespace(T_world_camera=T_world_camera),
         scale=Scale(mode, ScaleEstimate(1.0, 0.0, 9), np.ones(1), {}, unit),
     )
-    return MapMetrics.of(**map_errors(lambda: iter(np.array_split(points / scale, 3)), result, sequence)).tree()
+    return MapMetrics.of(
+        **map_errors(lambda: iter(np.array_split(points / scale, 3)), result, sequence)
+    ).tree()
 
 
 def test_true_depth_at_true_poses_has_no_error(
@@ -124,7 +128,9 @@ def test_scans_that_cannot_be_read_measure_nothing(on_disk: Path, true_map: Floa
     assert found["completeness"] is None and found["completeness_reason"]
 
 
-def test_an_excerpt_has_the_truth_of_its_own_frames(embedded: SimulatedSequence, on_disk: Path) -> None:
+def test_an_excerpt_has_the_truth_of_its_own_frames(
+    embedded: SimulatedSequence, on_disk: Path
+) -> None:
     for sequence in (embedded.cut(4, 12), open_sequence(on_disk, frames="4:12")):
         camera = sequence.intrinsics
         depth = embedded.true_depth(9)
@@ -138,9 +144,14 @@ def test_one_scale_is_fitted_apart(on_disk: Path, true_map: FloatArray) -> None:
     sequence = open_sequence(on_disk)
     found = errors(true_map, sequence, scale=1.1)
     assert found["accuracy_median_m"] > 0.1
-    assert found["with_scale"]["scale"] == pytest.approx(1.1) and found["with_scale"]["accuracy_median_m"] < 0.03
+    assert (
+        found["with_scale"]["scale"] == pytest.approx(1.1)
+        and found["with_scale"]["accuracy_median_m"] < 0.03
+    )
     unknown = errors(true_map, sequence, mode="none", scale=1.65)
-    assert unknown["accuracy_median_m"] is None and "with_scale" in unknown["accuracy_median_m_reason"]
+    assert (
+        unknown["accuracy_median_m"] is None and "with_scale" in unknown["accuracy_median_m_reason"]
+    )
     assert unknown["with_scale"]["accuracy_median_m"] < 0.03
 
 
@@ -150,12 +161,17 @@ def test_without_truth_every_number_has_a_reason(on_disk: Path) -> None:
     sequence.depth_maps, sequence.scans = {}, {}
     found = errors(np.zeros((5, 3)), sequence)
     missing = [key for key in found if not key.endswith("_reason")]
-    assert all(found[key] is None and "neither depth maps nor LiDAR" in found[f"{key}_reason"] for key in missing)
+    assert all(
+        found[key] is None and "neither depth maps nor LiDAR" in found[f"{key}_reason"]
+        for key in missing
+    )
     sequence.reference = None
     assert find_truth(sequence) == "the sequence has no true poses"
 
 
-def test_a_damaged_depth_map_costs_the_error_of_the_map_and_no_more(on_disk: Path, true_map: FloatArray) -> None:
+def test_a_damaged_depth_map_costs_the_error_of_the_map_and_no_more(
+    on_disk: Path, true_map: FloatArray
+) -> None:
     sequence = open_sequence(on_disk)
     assert isinstance(sequence, RecordedSequence)
     sequence.depth_maps[3] = partial(read_depth_map, on_disk / "camera.yaml")
@@ -211,7 +227,9 @@ def test_a_depth_map_that_cannot_be_read_is_left_out_with_one_warning(
 
 
 def test_every_missing_number_has_its_reason(tmp_path: Path) -> None:
-    def reasons(metric: bool, sequence: RecordedSequence, *keyframes: KeyframeDepth, is_refined: bool = True):
+    def reasons(
+        metric: bool, sequence: RecordedSequence, *keyframes: KeyframeDepth, is_refined: bool = True
+    ):
         quality = DepthQuality(sequence, metric)
         for one in keyframes:
             quality.add(one)
@@ -222,7 +240,10 @@ def test_every_missing_number_has_its_reason(tmp_path: Path) -> None:
     assert "mapping.enabled" in reasons(True, known)[0]
     assert "no true depth" in reasons(True, recorded(), keyframe())[1]
     assert "not in metres" in reasons(False, known, keyframe())[0]
-    assert reasons(True, known, keyframe(False)) == (None, "no keyframe has a neighbour at a useful distance")
+    assert reasons(True, known, keyframe(False)) == (
+        None,
+        "no keyframe has a neighbour at a useful distance",
+    )
     assert reasons(True, known, keyframe(False), is_refined=False) == (None, "depth.refine is none")
 
 
@@ -244,7 +265,8 @@ def factors(student_t_dof: float) -> list[RelativePose]:
         errors *= np.sqrt((student_t_dof - 2) / rng.chisquare(student_t_dof, (COUNT - 1, 1)))
     measured = se3.invert(T[:-1]) @ T[1:] @ se3.from_rotation_vector(errors[:, :3], errors[:, 3:])
     return [
-        RelativePose(k, k + 1, T_k, SIGMAS, "network", student_t_dof=student_t_dof) for k, T_k in enumerate(measured)
+        RelativePose(k, k + 1, T_k, SIGMAS, "network", student_t_dof=student_t_dof)
+        for k, T_k in enumerate(measured)
     ]
 
 
@@ -281,8 +303,12 @@ def test_overconfident_factors_are_found_by_source() -> None:
     assert kinds[LOOP_SOURCE]["factors"] == 100 and kinds[LOOP_SOURCE]["95"] < 0.2
     assert kinds["network"] == {"factors": len(honest), **coverage(honest, truth(), 1.0)[""]}
     heavy = [replace(f, source="essential") for f in factors(4.0)]
-    covered = coverage(honest + heavy, truth(), 1.0)  # each factor has the bound of its own distribution
-    assert covered[""]["90"] == pytest.approx((covered["network"]["90"] + covered["essential"]["90"]) / 2)
+    covered = coverage(
+        honest + heavy, truth(), 1.0
+    )  # each factor has the bound of its own distribution
+    assert covered[""]["90"] == pytest.approx(
+        (covered["network"]["90"] + covered["essential"]["90"]) / 2
+    )
 
 
 @pytest.mark.data
@@ -291,21 +317,41 @@ def test_the_recorded_track_of_a_drive(data_root: Path, tmp_path: Path) -> None:
     """Fixes with 0.2 m of noise added give a metric scale without the road, and hold the heading."""
     drive = data_root / DRIVE
     begin = np.datetime64((drive / "image_02/timestamps.txt").read_text().split("\n")[0], "ns")
-    times = np.array((drive / "oxts/timestamps.txt").read_text().split("\n"), dtype="datetime64[ns]")
+    times = np.array(
+        (drive / "oxts/timestamps.txt").read_text().split("\n"), dtype="datetime64[ns]"
+    )
     stamps = (times[~np.isnat(times)] - begin).astype(np.float64) * 1e-9
     packets = sorted((drive / "oxts/data").glob("*.txt"))
-    places = np.array([np.array(path.read_text().split()[:3], dtype=np.float64) for path in packets])
+    places = np.array(
+        [np.array(path.read_text().split()[:3], dtype=np.float64) for path in packets]
+    )
     places += np.random.default_rng(0).normal(size=places.shape) * [0.2 / 111e3, 0.2 / 73e3, 0.2]
     table = np.column_stack([stamps, places])
-    np.savetxt(tmp_path / "gps.csv", table, "%.10g", ",", header="stamp,latitude,longitude,altitude", comments="")
-    settings = ["scale.mode=gps", "mapping.enabled=false", "gps.sigma_m=0.2", "gps.vertical_sigma_m=0.2"]
+    np.savetxt(
+        tmp_path / "gps.csv",
+        table,
+        "%.10g",
+        ",",
+        header="stamp,latitude,longitude,altitude",
+        comments="",
+    )
+    settings = [
+        "scale.mode=gps",
+        "mapping.enabled=false",
+        "gps.sigma_m=0.2",
+        "gps.vertical_sigma_m=0.2",
+    ]
     settings.append("gps.correlation_s=0")
-    folder = run_slam(drive, gps=tmp_path / "gps.csv", frames="0:60", overrides=settings, output=tmp_path / "run")
+    folder = run_slam(
+        drive, gps=tmp_path / "gps.csv", frames="0:60", overrides=settings, output=tmp_path / "run"
+    )
     metrics = folder.metrics().tree()
     assert metrics["scale"]["mode"] == "gps" and metrics["gps"]["fixes"] == 59
     assert metrics["trajectories"]["optimised"]["align"]["6dof"]["ate_rmse_m"] < 0.2
     assert metrics["gps"]["optimised"]["horizontal_median_m"] < 0.3
     assert abs(metrics["gps"]["origin"]["heading_deg"] - 345) < 3
     origin = metrics["gps"]["origin"]
-    assert [origin["longitude_deg"], origin["latitude_deg"]] == pytest.approx([8.43781, 49.01314], abs=1e-4)
+    assert [origin["longitude_deg"], origin["latitude_deg"]] == pytest.approx(
+        [8.43781, 49.01314], abs=1e-4
+    )
     assert "of the GPS track" in (folder.path / "report.html").read_text()

@@ -35,7 +35,9 @@ def test_new_folders_carry_the_sequence_and_latest_points_to_the_newest(tmp_path
 def begin(output: Path) -> RunFolder:
     """A new run into ``output``, before it has a trajectory."""
     folder = RunFolder.create(output, output.parent, "sim")
-    folder.write_metrics(Metrics(schema_=1, status="running", provenance=Provenance(weights_sha256="00")))
+    folder.write_metrics(
+        Metrics(schema_=1, status="running", provenance=Provenance(weights_sha256="00"))
+    )
     return folder
 
 
@@ -75,16 +77,25 @@ def test_runs_that_begin_in_the_same_second_get_a_folder_each(tmp_path: Path) ->
 )
 def test_files_of_other_programs_are_not_replaced(tmp_path: Path, name: str, text: str) -> None:
     (tmp_path / name).write_text(text)
-    with pytest.raises(RunError, match=r"not empty and holds no run of erfsfm-slam: choose another --output"):
+    with pytest.raises(
+        RunError, match=r"not empty and holds no run of erfsfm-slam: choose another --output"
+    ):
         RunFolder.create(tmp_path, tmp_path, "sim")
     assert contents(tmp_path) == {name: text.encode()}
 
 
-def test_a_run_that_did_not_end_is_opened_with_one_note(make_run: MakeRun, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_run_that_did_not_end_is_opened_with_one_note(
+    make_run: MakeRun, caplog: pytest.LogCaptureFixture
+) -> None:
     folder = make_run()
     RunFolder.open(folder.path)
     assert caplog.records == []
-    failed = {"schema": 1, "status": "failed", "reason": "no space", "provenance": {"weights_sha256": "00"}}
+    failed = {
+        "schema": 1,
+        "status": "failed",
+        "reason": "no space",
+        "provenance": {"weights_sha256": "00"},
+    }
     folder.write_metrics(Metrics.model_validate(failed))
     RunFolder.open(folder.path)
     assert [record.getMessage() for record in caplog.records] == [
@@ -95,7 +106,8 @@ def test_a_run_that_did_not_end_is_opened_with_one_note(make_run: MakeRun, caplo
 
 
 @pytest.mark.parametrize(
-    "reason", ["the map is empty: no depth passed the filters", "fusion is switched off (mapping.enabled)"]
+    "reason",
+    ["the map is empty: no depth passed the filters", "fusion is switched off (mapping.enabled)"],
 )
 def test_a_missing_map_is_explained_by_the_run(make_run: MakeRun, reason: str) -> None:
     folder = make_run()
@@ -103,8 +115,12 @@ def test_a_missing_map_is_explained_by_the_run(make_run: MakeRun, reason: str) -
     folder.write_metrics(folder.metrics().changed(map=MapMetrics.unknown(reason)))
     with pytest.raises(RunError, match=re.escape(f"has no map_mesh.ply: {reason}")):
         folder.require("map_mesh.ply")
-    folder.write_metrics(folder.metrics().changed(map=Failed("the run ended before its map was whole")))
-    with pytest.raises(RunError, match=r"has no map_mesh\.ply: the run ended before its map was whole"):
+    folder.write_metrics(
+        folder.metrics().changed(map=Failed("the run ended before its map was whole"))
+    )
+    with pytest.raises(
+        RunError, match=r"has no map_mesh\.ply: the run ended before its map was whole"
+    ):
         folder.require("map_mesh.ply")
 
 

@@ -47,14 +47,26 @@ def test_a_leak_and_missing_numbers_are_noted(
 ) -> None:
     text = printed(side_by_side([make_run("seen", make_metrics(leak=True))]))
     assert "seen, LEAK" in text
-    assert "lidar: the sequence has no LiDAR scans" in text and "odometry: no segment of 100 m was left" in text
+    assert (
+        "lidar: the sequence has no LiDAR scans" in text
+        and "odometry: no segment of 100 m was left" in text
+    )
 
 
 @pytest.mark.parametrize(("status", "word"), [("failed", "failed"), ("estimated", "did not end")])
 def test_a_run_that_did_not_end_has_its_reason(
-    make_run: MakeRun, make_metrics: MakeMetrics, printed: Callable[[Table], str], status: str, word: str
+    make_run: MakeRun,
+    make_metrics: MakeMetrics,
+    printed: Callable[[Table], str],
+    status: str,
+    word: str,
 ) -> None:
-    failed = {"schema": 1, "status": status, "reason": "no motion [bold]between[/bold] frames", "provenance": None}
+    failed = {
+        "schema": 1,
+        "status": status,
+        "reason": "no motion [bold]between[/bold] frames",
+        "provenance": None,
+    }
     early = make_run("early", make_metrics() | {"status": status, "reason": "no space left"})
     text = printed(side_by_side([early, make_run("bad", failed)]))
     assert f"bad {word}: no motion [bold]between[/bold] frames" in text
@@ -100,9 +112,16 @@ def test_two_files_are_compared_under_every_alignment(printed: Callable[[Table],
 def test_missing_numbers_are_dashes_with_one_reason_each(printed: Callable[[Table], str]) -> None:
     text = printed(
         errors_table(
-            {"network": errors_of(50), "odometry": errors_of(50), "lidar": TrajectoryMetrics(absent="not recorded")}
+            {
+                "network": errors_of(50),
+                "odometry": errors_of(50),
+                "lidar": TrajectoryMetrics(absent="not recorded"),
+            }
         )
     )
     assert text.count("no segment of 100 m fits") == 1 and "– network, odometry: no segment" in text
     assert "– lidar: not recorded." in text
-    assert next(line for line in text.splitlines() if "lidar" in line).split() == ["lidar", *["–"] * 6]
+    assert next(line for line in text.splitlines() if "lidar" in line).split() == [
+        "lidar",
+        *["–"] * 6,
+    ]

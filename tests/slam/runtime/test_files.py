@@ -16,15 +16,23 @@ def test_makes_folders_and_replaces_what_was_there(tmp_path: Path) -> None:
 
         def fill(partial: Path, text: str = text) -> None:
             partial.write_text(text)
-            assert partial.suffix == ".ply" and partial.parent == path.parent and partial.name.startswith(".")
+            assert (
+                partial.suffix == ".ply"
+                and partial.parent == path.parent
+                and partial.name.startswith(".")
+            )
 
         write_atomically(path, fill)
         assert path.read_text() == text
     assert [p.name for p in path.parent.iterdir()] == ["map.ply"]
 
 
-@pytest.mark.parametrize("failure", [OSError(28, "No space left on device"), RunError("empty"), KeyboardInterrupt()])
-def test_after_any_failure_the_old_file_stays_and_no_partial_file(tmp_path: Path, failure: BaseException) -> None:
+@pytest.mark.parametrize(
+    "failure", [OSError(28, "No space left on device"), RunError("empty"), KeyboardInterrupt()]
+)
+def test_after_any_failure_the_old_file_stays_and_no_partial_file(
+    tmp_path: Path, failure: BaseException
+) -> None:
     path = tmp_path / "run.log"
     path.write_text("old")
 
@@ -32,7 +40,9 @@ def test_after_any_failure_the_old_file_stays_and_no_partial_file(tmp_path: Path
         partial.write_text("half")
         raise failure
 
-    full_disk = pytest.raises(SlamError, match=r"run\.log: cannot be written \(No space left on device\)$")
+    full_disk = pytest.raises(
+        SlamError, match=r"run\.log: cannot be written \(No space left on device\)$"
+    )
     with full_disk if isinstance(failure, OSError) else pytest.raises(type(failure)):
         write_atomically(path, fill)
     assert path.read_text() == "old"

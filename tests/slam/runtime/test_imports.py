@@ -36,5 +36,7 @@ assert import_open3d().visualization.draw_plotly
     ids=["windows at their first use", "whole in a notebook"],
 )
 def test_open3d_is_imported(code: str) -> None:
-    finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    finished = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
     assert finished.returncode == 0, finished.stderr

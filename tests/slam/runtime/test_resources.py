@@ -14,7 +14,11 @@ from slam.runtime.resources import SpillFile, Stopwatch
 
 def test_arrays_come_back_in_any_order() -> None:
     rng = np.random.default_rng(0)
-    arrays = [rng.integers(0, 255, (4, 5, 3), np.uint8), rng.normal(size=(4, 5)).astype(np.float32)[:, ::2], np.eye(4)]
+    arrays = [
+        rng.integers(0, 255, (4, 5, 3), np.uint8),
+        rng.normal(size=(4, 5)).astype(np.float32)[:, ::2],
+        np.eye(4),
+    ]
     spill_file = SpillFile()
     kept = [spill_file.put(array) for array in arrays]
     kept[0].read()

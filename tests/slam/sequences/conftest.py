@@ -32,7 +32,12 @@ def write_poses(path: Path, frames: int) -> None:
 
 
 def write_odometry_sequence(
-    base: Path, name: str = "00", frames: int = 6, camera: int = 2, suffix: str = ".png", poses: bool = True
+    base: Path,
+    name: str = "00",
+    frames: int = 6,
+    camera: int = 2,
+    suffix: str = ".png",
+    poses: bool = True,
 ) -> Path:
     folder = base / "sequences" / name
     write_images(folder / f"image_{camera}", [f"{k:06d}{suffix}" for k in range(frames)])

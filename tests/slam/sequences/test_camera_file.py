@@ -39,7 +39,10 @@ def test_search_order(tmp_path: Path, camera_yaml: str) -> None:
     assert find_camera_file(None, inner, tmp_path, wanted_by="images", images=IMAGES).fps == 5
     written(inner, camera_yaml.replace("fps: 5", "fps: 6"))
     assert find_camera_file(None, inner, tmp_path, wanted_by="images", images=IMAGES).fps == 6
-    assert find_camera_file(tmp_path / "camera.yaml", inner, wanted_by="images", images=IMAGES).fps == 5
+    assert (
+        find_camera_file(tmp_path / "camera.yaml", inner, wanted_by="images", images=IMAGES).fps
+        == 5
+    )
     with pytest.raises(SequenceError, match=r"no camera file .*nowhere\.yaml"):
         find_camera_file(tmp_path / "nowhere.yaml", inner, wanted_by="images", images=IMAGES)
 
@@ -49,8 +52,16 @@ def test_a_horizontal_field_of_view_is_a_camera(tmp_path: Path) -> None:
     assert (camera.width, camera.height, camera.fps) == (40, 24, 10)
     assert camera.fx == camera.fy == pytest.approx(20)  # half the width of 40 pixels at 45 degrees
     assert (camera.cx, camera.cy) == (19.5, 11.5)
-    assert find_camera_file(Path("fov=90,fps=25"), tmp_path, wanted_by="images", images=IMAGES, fps=30).fps == 25
-    assert find_camera_file(Path("fov=90"), tmp_path, wanted_by="images", images=IMAGES, fps=30).fps == 30
+    assert (
+        find_camera_file(
+            Path("fov=90,fps=25"), tmp_path, wanted_by="images", images=IMAGES, fps=30
+        ).fps
+        == 25
+    )
+    assert (
+        find_camera_file(Path("fov=90"), tmp_path, wanted_by="images", images=IMAGES, fps=30).fps
+        == 30
+    )
 
 
 KALIBR = """cam0:
@@ -93,12 +104,24 @@ COLMAP = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 OPENCV 40 24 30 31 20.5
 
 @pytest.mark.parametrize(
     ("name", "text", "fps"),
-    [("camchain.yaml", KALIBR, 10), ("front.yaml", ROS, 10), ("TUM1.yaml", ORB, 20), ("cameras.txt", COLMAP, 10)],
+    [
+        ("camchain.yaml", KALIBR, 10),
+        ("front.yaml", ROS, 10),
+        ("TUM1.yaml", ORB, 20),
+        ("cameras.txt", COLMAP, 10),
+    ],
 )
 def test_the_same_camera_by_every_program(tmp_path: Path, name: str, text: str, fps: float) -> None:
     (tmp_path / name).write_text(text)
     camera = read_explicit(tmp_path / name)
-    assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (40, 24, 30, 31, 20, 12)
+    assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (
+        40,
+        24,
+        30,
+        31,
+        20,
+        12,
+    )
     assert camera.model == "opencv" and camera.fps == fps
     np.testing.assert_array_equal(camera.distortion[:4], [-0.1, 0.02, 0.001, -0.002])
 
@@ -119,7 +142,11 @@ def test_lenses(tmp_path: Path) -> None:
     ("name", "text", "words"),
     [
         ("camchain.yaml", KALIBR.replace("radtan", "spiral"), "spiral"),
-        ("camchain.yaml", KALIBR.replace("  resolution: [40, 24]\n", ""), "Kalibr.* lacks 'resolution'"),
+        (
+            "camchain.yaml",
+            KALIBR.replace("  resolution: [40, 24]\n", ""),
+            "Kalibr.* lacks 'resolution'",
+        ),
         ("cameras.txt", "1 THIN_PRISM 40 24 1 2 3\n", "THIN_PRISM"),
         ("cameras.txt", "nothing\n", "CAMERA_ID"),
     ],
@@ -133,7 +160,15 @@ def test_what_is_wrong_is_one_line(tmp_path: Path, name: str, text: str, words: 
 
 def lens(name: str) -> CameraFile:
     model, distortion = LENSES[name]
-    calibration = {"width": WIDTH, "height": HEIGHT, "fx": 180, "fy": 175, "cx": 163, "cy": 117, "fps": 10}
+    calibration = {
+        "width": WIDTH,
+        "height": HEIGHT,
+        "fx": 180,
+        "fy": 175,
+        "cx": 163,
+        "cy": 117,
+        "fps": 10,
+    }
     return CameraFile.model_validate(calibration | {"model": model, "distortion": distortion})
 
 
@@ -173,8 +208,12 @@ def test_folding_lens_is_refused_or_cropped() -> None:
     """A radius that runs backwards must not come into the image."""
     camera = lens("barrel").model_copy(update={"distortion": (-0.9, 0.0, 0.0, 0.0)})
     undistortion = Undistortion(camera)
-    corner = (np.array([[0.0, 0.0]]) - undistortion.intrinsics.K[:2, 2]) / undistortion.intrinsics.fx
-    assert np.linalg.norm(corner) < (1 / (3 * 0.9)) ** 0.5 * 1.03  # where r (1 - 0.9 r^2) is largest
+    corner = (
+        np.array([[0.0, 0.0]]) - undistortion.intrinsics.K[:2, 2]
+    ) / undistortion.intrinsics.fx
+    assert (
+        np.linalg.norm(corner) < (1 / (3 * 0.9)) ** 0.5 * 1.03
+    )  # where r (1 - 0.9 r^2) is largest
     hopeless = lens("barrel").model_copy(update={"distortion": (400.0, 0.0, 0.0, 0.0)})
     with pytest.raises(SequenceError, match="leaves no image free of black borders"):
         Undistortion(hopeless)

@@ -16,7 +16,9 @@ def test_several_sequences_are_listed(tmp_path: Path, odometry) -> None:
     for name in ("02", "10", "00"):
         odometry(tmp_path, name=name, frames=2)
     assert list(sequence_kinds(tmp_path)) == ["00", "02", "10"]
-    with pytest.raises(SequenceError, match="has 3 sequences: 00, 02, 10; choose one with --sequence"):
+    with pytest.raises(
+        SequenceError, match="has 3 sequences: 00, 02, 10; choose one with --sequence"
+    ):
         open_sequence(tmp_path, None, None, None)
     with pytest.raises(SequenceError) as caught:
         open_sequence(tmp_path, "09", None, None)
@@ -46,22 +48,35 @@ def test_name_of_a_folder_inside(tmp_path: Path, images, camera_yaml: str) -> No
 
 def test_the_door_is_light() -> None:
     code = "import sys, slam.sequences.catalogue; print({'torch', 'gtsam', 'open3d', 'evo'} & sys.modules.keys())"
-    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    answer = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert answer.stdout.strip() == "set()"
 
 
-def test_a_folder_of_recordings_lists_all(tmp_path: Path, images, odometry, camera_yaml: str) -> None:
+def test_a_folder_of_recordings_lists_all(
+    tmp_path: Path, images, odometry, camera_yaml: str
+) -> None:
     images(tmp_path / "left", ["0.png"])
     images(tmp_path / "right/images", ["0.png"])
     odometry(tmp_path / "kitti", name="03", frames=2)
     odometry(tmp_path / "kitti", name="04", frames=2)
-    (tmp_path / "2011_09_26_drive_0013_extract").mkdir()  # refused where it is given, here it is only left out
+    (
+        tmp_path / "2011_09_26_drive_0013_extract"
+    ).mkdir()  # refused where it is given, here it is only left out
     (tmp_path / "camera.yaml").write_text(camera_yaml)
-    kinds = {"kitti/03": "KITTI odometry", "kitti/04": "KITTI odometry", "left": "images", "right": "images"}
+    kinds = {
+        "kitti/03": "KITTI odometry",
+        "kitti/04": "KITTI odometry",
+        "left": "images",
+        "right": "images",
+    }
     assert sequence_kinds(tmp_path) == kinds
     for name in kinds:
         assert len(open_sequence(tmp_path, name)) == 1 + ("kitti" in name)
-    with pytest.raises(SequenceError, match="has 4 sequences: kitti/03, kitti/04, left, right; choose one"):
+    with pytest.raises(
+        SequenceError, match="has 4 sequences: kitti/03, kitti/04, left, right; choose one"
+    ):
         open_sequence(tmp_path)
 
 
@@ -107,7 +122,9 @@ def test_files_named_by_their_time(trip: Path) -> None:
     np.testing.assert_allclose(np.diff(sequence.stamps)[[19, 39, 59]], [0.1, 0.1, 2.1], atol=1e-6)
 
 
-def test_clips_named_by_the_minute_that_are_shorter(trip: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_clips_named_by_the_minute_that_are_shorter(
+    trip: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     for k, minute in enumerate((0, 1, 2, 4)):
         write_clip(trip / f"20240101_12{minute:02d}00_F.avi", 20 * k)
     gaps = np.diff(open_sequence(trip).stamps)

@@ -67,10 +67,14 @@ def test_euroc_opens(flight: Path, given: str) -> None:
     assert sequence.intrinsics.fx != 30 and sequence.frame(3).image.shape == (24, 40, 3)
     # the camera is turned by 90 degrees about the body's z: its x axis is the body's y
     assert sequence.reference is not None
-    assert sequence.reference[:, :3, 3] == pytest.approx(np.outer(np.arange(FRAMES), [1, 0, 0]), abs=1e-6)
+    assert sequence.reference[:, :3, 3] == pytest.approx(
+        np.outer(np.arange(FRAMES), [1, 0, 0]), abs=1e-6
+    )
 
 
-def test_true_poses_of_some_frames_are_those_of_an_excerpt(flight: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_true_poses_of_some_frames_are_those_of_an_excerpt(
+    flight: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     write_truth(flight, 3, FRAMES)
     with caplog.at_level(logging.WARNING):
         assert open_sequence(flight).reference is None
@@ -114,7 +118,12 @@ def test_a_camera_file_replaces_the_calibration_and_one_beside_gives_the_height(
         ("sensor.yaml", "radial-tangential", "omni", "omni is unknown: known are .*give --camera"),
         ("sensor.yaml", "resolution:", "size:", "lacks .resolution"),
         ("sensor.yaml", "T_BS", "T_SB", "needs T_BS with data of 4 x 4 numbers"),
-        ("sensor.yaml", "rate_hz: 20", "rate_hz: !!python/object/apply:os.getcwd []", "could not determine"),
+        (
+            "sensor.yaml",
+            "rate_hz: 20",
+            "rate_hz: !!python/object/apply:os.getcwd []",
+            "could not determine",
+        ),
     ],
 )
 def test_euroc_damage(flight: Path, name: str, old: str, new: str, message: str) -> None:
@@ -155,7 +164,10 @@ def freiburg(tmp_path: Path, images, camera_yaml: str) -> Path:
 def write_tum_truth(freiburg: Path, stamps: np.ndarray) -> None:
     """Straight ahead at 1 m/s, turning about y by 0.5 rad/s."""
     half = 0.25 * (stamps - 100)
-    rows = [f"{s:.4f} 0 0 {s - 100:.6f} 0 {np.sin(h):.9f} 0 {np.cos(h):.9f}\n" for s, h in zip(stamps, half)]
+    rows = [
+        f"{s:.4f} 0 0 {s - 100:.6f} 0 {np.sin(h):.9f} 0 {np.cos(h):.9f}\n"
+        for s, h in zip(stamps, half)
+    ]
     (freiburg / "groundtruth.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + "".join(rows))
 
 
@@ -174,7 +186,9 @@ def test_tum_truth_is_interpolated(freiburg: Path) -> None:
     assert reference is not None
     assert np.array_equal(reference[0], np.eye(4))
     # 0.03 s after the first image, seen from a camera turned by 0.01 rad
-    assert reference[1, :3, 3] == pytest.approx([-0.03 * np.sin(0.01), 0, 0.03 * np.cos(0.01)], abs=1e-6)
+    assert reference[1, :3, 3] == pytest.approx(
+        [-0.03 * np.sin(0.01), 0, 0.03 * np.cos(0.01)], abs=1e-6
+    )
     assert reference[1, 0, 2] == pytest.approx(np.sin(0.015), abs=1e-6)
 
 
@@ -203,8 +217,12 @@ def test_tum_bad_rows_are_left_out(freiburg: Path, caplog: pytest.LogCaptureFixt
     assert len(again) == len(known) and "2 of " in caplog.text
 
 
-@pytest.mark.parametrize("rows", [("100.035 near.png", "100.30 far.png"), ("100.30 far.png", "100.035 near.png")])
-def test_registered_depth_maps_belong_to_the_images_of_their_stamps(freiburg: Path, rows: tuple[str, str]) -> None:
+@pytest.mark.parametrize(
+    "rows", [("100.035 near.png", "100.30 far.png"), ("100.30 far.png", "100.035 near.png")]
+)
+def test_registered_depth_maps_belong_to_the_images_of_their_stamps(
+    freiburg: Path, rows: tuple[str, str]
+) -> None:
     sequence = open_sequence(freiburg)
     assert sequence.true_depth_frames() == []
     cv2.imwrite(str(freiburg / "near.png"), np.full((4, 6), 10_000, dtype=np.uint16))
@@ -224,10 +242,14 @@ LENS = "0.5 0.8 0.5 0.5 0.9"
 def walk(tmp_path: Path, images) -> Path:
     folder = tmp_path / "sequence_01"
     images(folder / "images", [f"{k:05d}.jpg" for k in range(6)])
-    (folder / "times.txt").write_text("".join(f"{k:05d} {100 + 0.05 * k:.6f} 3.5\n" for k in range(6)))
+    (folder / "times.txt").write_text(
+        "".join(f"{k:05d} {100 + 0.05 * k:.6f} 3.5\n" for k in range(6))
+    )
     (folder / "camera.txt").write_text(f"{LENS}\n40 24\ncrop\n40 24\n")
     rows = [f"{100 + 0.05 * k:.6f} 0 0 {k} 0 0 0 1\n" for k in range(3)]
-    (folder / "groundtruthSync.txt").write_text("".join(rows) + "100.25 NaN NaN NaN NaN NaN NaN NaN\n")
+    (folder / "groundtruthSync.txt").write_text(
+        "".join(rows) + "100.25 NaN NaN NaN NaN NaN NaN NaN\n"
+    )
     return folder
 
 
@@ -302,7 +324,9 @@ def scene(tmp_path: Path, images) -> Path:
         (folder / name).mkdir()
         for k in (20, 30, 40, 50) if text else ():
             (folder / name / f"{k}.txt").write_text(LOST if k == 30 else text.format(k=k, z=1))
-    (folder / "intrinsic/intrinsic_color.txt").write_text("30 0 20 0\n0 31 12 0\n0 0 1 0\n0 0 0 1\n")
+    (folder / "intrinsic/intrinsic_color.txt").write_text(
+        "30 0 20 0\n0 31 12 0\n0 0 1 0\n0 0 0 1\n"
+    )
     (folder / "depth").mkdir()
     cv2.imwrite(str(folder / "depth/40.png"), np.full((12, 20), 2500, np.uint16))
     return folder
@@ -350,7 +374,9 @@ def nuscenes(tmp_path: Path, images) -> Path:
     root = tmp_path / "nuscenes"
     images(root / "samples/CAM_FRONT", [f"{k}.jpg" for k in range(KEY_FRAMES)])
     (root / "samples/LIDAR_TOP").mkdir(parents=True)
-    np.array([[1, 2, 3, 4, 5], [6, 7, 8, 9, 0]], np.float32).tofile(root / "samples/LIDAR_TOP/2.pcd.bin")
+    np.array([[1, 2, 3, 4, 5], [6, 7, 8, 9, 0]], np.float32).tofile(
+        root / "samples/LIDAR_TOP/2.pcd.bin"
+    )
     mounts = {"cam": ([1.7, 0, 1.5], AHEAD), "lidar": ([0.9, 0, 1.8], [1, 0, 0, 0])}
     data: list[dict[str, Any]] = []
     for k in (3, 0, 1, 4, 2):
@@ -361,18 +387,37 @@ def nuscenes(tmp_path: Path, images) -> Path:
             "width": 40,
             "height": 24,
         }
-        data.append({**row, "timestamp": 10**15 + 80_000 * k, "filename": f"samples/CAM_FRONT/{k}.jpg"})
-    row = {"sample_token": "s0", "ego_pose_token": "e2", "calibrated_sensor_token": "lidar", "width": 0, "height": 0}
+        data.append(
+            {**row, "timestamp": 10**15 + 80_000 * k, "filename": f"samples/CAM_FRONT/{k}.jpg"}
+        )
+    row = {
+        "sample_token": "s0",
+        "ego_pose_token": "e2",
+        "calibrated_sensor_token": "lidar",
+        "width": 0,
+        "height": 0,
+    }
     data.append({**row, "timestamp": 10**15 + 170_000, "filename": "samples/LIDAR_TOP/2.pcd.bin"})
     tables = {
         "scene": [{"token": "a", "name": "scene-0061"}, {"token": "b", "name": "scene-0103"}],
         "sample": [{"token": "s0", "scene_token": "a"}, {"token": "s1", "scene_token": "b"}],
         "sensor": [{"token": "c", "channel": "CAM_FRONT"}, {"token": "l", "channel": "LIDAR_TOP"}],
         "calibrated_sensor": [
-            {"token": name, "sensor_token": name[0], "translation": t, "rotation": q, "camera_intrinsic": K}
-            for (name, (t, q)), K in zip(mounts.items(), ([[30, 0, 20], [0, 30, 12], [0, 0, 1]], []), strict=True)
+            {
+                "token": name,
+                "sensor_token": name[0],
+                "translation": t,
+                "rotation": q,
+                "camera_intrinsic": K,
+            }
+            for (name, (t, q)), K in zip(
+                mounts.items(), ([[30, 0, 20], [0, 30, 12], [0, 0, 1]], []), strict=True
+            )
         ],
-        "ego_pose": [{"token": f"e{k}", "translation": [k, 5, 0], "rotation": [1, 0, 0, 0]} for k in range(KEY_FRAMES)],
+        "ego_pose": [
+            {"token": f"e{k}", "translation": [k, 5, 0], "rotation": [1, 0, 0, 0]}
+            for k in range(KEY_FRAMES)
+        ],
         "sample_data": data,
     }
     (root / "v1.0-mini").mkdir()
@@ -384,11 +429,17 @@ def nuscenes(tmp_path: Path, images) -> Path:
 def test_nuscenes(nuscenes: Path) -> None:
     assert sequence_kinds(nuscenes) == {"scene-0061": "nuScenes", "scene-0103": "nuScenes"}
     sequence = open_sequence(nuscenes, "scene-0061")
-    assert (len(sequence), sequence.intrinsics.fx, sequence.camera_height_m) == (KEY_FRAMES, 30, 1.5)
+    assert (len(sequence), sequence.intrinsics.fx, sequence.camera_height_m) == (
+        KEY_FRAMES,
+        30,
+        1.5,
+    )
     assert sequence.stamps == pytest.approx(1e9 + 0.08 * np.arange(KEY_FRAMES))
     assert sequence.frame(3).image[0, 0, 0] == pytest.approx(30, abs=2)
     assert sequence.reference is not None
-    assert sequence.reference[:, :3, 3] == pytest.approx(np.outer(np.arange(KEY_FRAMES), [0, 0, 1]), abs=1e-12)
+    assert sequence.reference[:, :3, 3] == pytest.approx(
+        np.outer(np.arange(KEY_FRAMES), [0, 0, 1]), abs=1e-12
+    )
     assert [k for k in range(KEY_FRAMES) if sequence.has_scan(k)] == [2]
     assert sequence.scan(2).tolist() == [[1, 2, 3], [6, 7, 8]]
     # the LiDAR is 0.8 m behind the camera and 0.3 m above it

@@ -24,7 +24,9 @@ from slam.sequences.images import ImageFiles
     ("inner", "beside", "suffix"),
     [("", False, ".png"), ("images", True, ".jpg"), ("data", False, ".jpeg"), ("", True, ".bmp")],
 )
-def test_layouts(tmp_path: Path, images, camera_yaml: str, inner: str, beside: bool, suffix: str) -> None:
+def test_layouts(
+    tmp_path: Path, images, camera_yaml: str, inner: str, beside: bool, suffix: str
+) -> None:
     folder = tmp_path / "drive"
     images(folder / inner, [f"f{k}{suffix}" for k in range(12)])
     ((tmp_path if beside else folder) / "camera.yaml").write_text(camera_yaml)
@@ -47,7 +49,9 @@ def test_inner_folder_has_the_outer_name(tmp_path: Path, images, camera_yaml: st
 
 def test_undistorts(tmp_path: Path, images, camera_yaml: str) -> None:
     images(tmp_path, ["0.png", "1.png"])
-    (tmp_path / "camera.yaml").write_text(camera_yaml + "model: opencv\ndistortion: [-0.2, 0, 0, 0]\n")
+    (tmp_path / "camera.yaml").write_text(
+        camera_yaml + "model: opencv\ndistortion: [-0.2, 0, 0, 0]\n"
+    )
     sequence = open_sequence(tmp_path, None, None, None)
     assert sequence.intrinsics.fx < 30 and (sequence.frame(1).image == 10).all()
 
@@ -65,22 +69,32 @@ def test_a_gap_in_the_numbers_is_a_gap_in_time(
         with pytest.raises(MissingFrameError, match=rf"no image {name}\.png in "):
             sequence.frame(index)
     (warning,) = caplog.records
-    assert "2 of 6 frames have no image; the first gap is f19.png to f20.png" in warning.getMessage()
+    assert (
+        "2 of 6 frames have no image; the first gap is f19.png to f20.png" in warning.getMessage()
+    )
     with pytest.raises(MissingFrameError):
         open_sequence(tmp_path, frames="1:4").frame(1)
 
 
-@pytest.mark.parametrize("fps, last", [(50, 202), (5, 60), (50, 10**15)], ids=["frames", "seconds", "for ever"])
-def test_a_long_gap_is_refused(tmp_path: Path, images, camera_yaml: str, fps: int, last: int) -> None:
+@pytest.mark.parametrize(
+    "fps, last", [(50, 202), (5, 60), (50, 10**15)], ids=["frames", "seconds", "for ever"]
+)
+def test_a_long_gap_is_refused(
+    tmp_path: Path, images, camera_yaml: str, fps: int, last: int
+) -> None:
     images(tmp_path, [f"{k}.png" for k in range(5)] + [f"{last}.png"])
     (tmp_path / "camera.yaml").write_text(camera_yaml.replace("fps: 5", f"fps: {fps}"))
-    with pytest.raises(SequenceError, match=rf"no images 5\.png to {last - 1}\.png .*split the recording") as caught:
+    with pytest.raises(
+        SequenceError, match=rf"no images 5\.png to {last - 1}\.png .*split the recording"
+    ) as caught:
         open_sequence(tmp_path)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("step", ["1e8", "1e-9", "nan"])
-def test_stamps_that_cannot_be_seconds_are_refused(tmp_path: Path, images, camera_yaml: str, step: str) -> None:
+def test_stamps_that_cannot_be_seconds_are_refused(
+    tmp_path: Path, images, camera_yaml: str, step: str
+) -> None:
     images(tmp_path, [f"{k}.png" for k in range(4)])
     (tmp_path / "camera.yaml").write_text(camera_yaml)
     (tmp_path / "times.txt").write_text("".join(f"{k * float(step):.12f}\n" for k in range(4)))
@@ -91,9 +105,13 @@ def test_stamps_that_cannot_be_seconds_are_refused(tmp_path: Path, images, camer
 @pytest.mark.parametrize("form", ["{}.{:06d}.png", "{}{:06d}000.png", "left_{}{:06d}.png"])
 def test_names_that_are_times(tmp_path: Path, images, camera_yaml: str, form: str) -> None:
     microseconds = [900_000, 933_333, 1_200_000]
-    images(tmp_path, [form.format(1403715273 + each // 10**6, each % 10**6) for each in microseconds])
+    images(
+        tmp_path, [form.format(1403715273 + each // 10**6, each % 10**6) for each in microseconds]
+    )
     (tmp_path / "camera.yaml").write_text(camera_yaml)
-    assert np.diff(open_sequence(tmp_path).stamps) == pytest.approx(np.diff(microseconds) / 1e6, abs=1e-6)
+    assert np.diff(open_sequence(tmp_path).stamps) == pytest.approx(
+        np.diff(microseconds) / 1e6, abs=1e-6
+    )
 
 
 @pytest.mark.parametrize(
@@ -125,18 +143,26 @@ def test_a_table_of_times_cut_to_match_as_advised(tmp_path: Path, images, camera
     assert len(open_sequence(tmp_path)) == 2
 
 
-def test_a_camera_of_another_size_scaled_as_advised(tmp_path: Path, images, camera_yaml: str) -> None:
+def test_a_camera_of_another_size_scaled_as_advised(
+    tmp_path: Path, images, camera_yaml: str
+) -> None:
     images(tmp_path, ["0.png", "1.png"])
     path = tmp_path / "camera.yaml"
     keys = yaml.safe_load(camera_yaml)
-    path.write_text(yaml.safe_dump({**keys, "width": 2 * keys["width"], "height": 2 * keys["height"]}))
+    path.write_text(
+        yaml.safe_dump({**keys, "width": 2 * keys["width"], "height": 2 * keys["height"]})
+    )
     with pytest.raises(SequenceError, match=r"scale the file to \{(.*)\}") as caught:
         open_sequence(tmp_path)
-    path.write_text(yaml.safe_dump(keys | yaml.safe_load("{" + str(caught.value).rpartition("{")[2])))
+    path.write_text(
+        yaml.safe_dump(keys | yaml.safe_load("{" + str(caught.value).rpartition("{")[2]))
+    )
     assert open_sequence(tmp_path).intrinsics.fx == pytest.approx(keys["fx"] / 2)
 
 
-def test_the_first_readable_image_gives_the_size_and_another_is_named(tmp_path: Path, images) -> None:
+def test_the_first_readable_image_gives_the_size_and_another_is_named(
+    tmp_path: Path, images
+) -> None:
     images(tmp_path, ["0.png", "1.png", "3.png"])
     images(tmp_path, ["2.png"], width=41)
     (tmp_path / "0.png").write_bytes(b"")
@@ -202,14 +228,19 @@ def write_mp4(path: Path, times: list[int], rate: int = 30, rotated: bool = Fals
 UNEVEN = [0, 20, 40, 100, 120, 140, 160, 220, 240, 260]
 
 
-def test_uneven_frame_times_are_used(tmp_path: Path, camera_64: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_uneven_frame_times_are_used(
+    tmp_path: Path, camera_64: str, caplog: pytest.LogCaptureFixture
+) -> None:
     path = write_mp4(tmp_path / "phone.mp4", UNEVEN)
     camera = tmp_path / "camera.yaml"
     camera.write_text(camera_64.replace("fps: 5", "fps: 20"))
     assert open_sequence(path).stamps == pytest.approx(np.array(UNEVEN) / 600)
     camera.write_text(camera_64)
     assert open_sequence(path).stamps == pytest.approx(np.arange(10) / 5)
-    assert "has 20.77 frames a second, the camera has 5: taken as even at the camera's rate" in caplog.text
+    assert (
+        "has 20.77 frames a second, the camera has 5: taken as even at the camera's rate"
+        in caplog.text
+    )
 
 
 def test_missing_frames_do_not_change_the_rate(tmp_path: Path, camera_64: str) -> None:
@@ -224,11 +255,18 @@ def test_even_frames_have_the_rate_of_the_video(
 ) -> None:
     path = write_mp4(tmp_path / "phone.mp4", [120 * k for k in range(12)])
     camera = tmp_path / "camera.yaml"
-    for fps, stamps in (("5.02", np.arange(12) / 5.02), ("5.4", np.arange(12) / 5), ("10", np.arange(12) / 10)):
+    for fps, stamps in (
+        ("5.02", np.arange(12) / 5.02),
+        ("5.4", np.arange(12) / 5),
+        ("10", np.arange(12) / 10),
+    ):
         assert "frames a second" not in caplog.text
         camera.write_text(camera_64.replace("fps: 5", f"fps: {fps}"))
         assert open_sequence(path).stamps == pytest.approx(stamps, abs=1e-9), fps
-    assert "phone.mp4 has 5 frames a second, the camera has 10: taken as even at the camera's rate" in caplog.text
+    assert (
+        "phone.mp4 has 5 frames a second, the camera has 10: taken as even at the camera's rate"
+        in caplog.text
+    )
 
 
 def test_a_field_of_view_takes_the_rate_of_the_video(tmp_path: Path) -> None:

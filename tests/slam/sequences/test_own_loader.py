@@ -25,14 +25,20 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
 
     def package(page: Path) -> str:
         text = page.read_text(encoding="utf-8")
-        (entry_point,) = re.findall(r"```toml\n\[project\.entry-points\.\"(.*?)\"\]\n(.*?)```", text, re.DOTALL)
+        (entry_point,) = re.findall(
+            r"```toml\n\[project\.entry-points\.\"(.*?)\"\]\n(.*?)```", text, re.DOTALL
+        )
         group, (module,) = entry_point[0], re.findall(r"\"(.*?):", entry_point[1])
         code = text.partition(entry_point[1])[2].partition("```python\n")[2].partition("```")[0]
         (tmp_path / "site" / f"{module}-1.dist-info").mkdir(parents=True)
         (tmp_path / "site" / f"{module}.py").write_text(code)
-        (tmp_path / "site" / f"{module}-1.dist-info" / "METADATA").write_text(f"Name: {module}\nVersion: 1\n")
+        (tmp_path / "site" / f"{module}-1.dist-info" / "METADATA").write_text(
+            f"Name: {module}\nVersion: 1\n"
+        )
         quoted = entry_point[1].replace('"', "")
-        (tmp_path / "site" / f"{module}-1.dist-info" / "entry_points.txt").write_text(f"[{group}]\n{quoted}")
+        (tmp_path / "site" / f"{module}-1.dist-info" / "entry_points.txt").write_text(
+            f"[{group}]\n{quoted}"
+        )
         monkeypatch.syspath_prepend(tmp_path / "site")
         monkeypatch.delitem(sys.modules, module, raising=False)
         plug_ins.cache_clear()
@@ -42,22 +48,39 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
     plug_ins.cache_clear()
 
 
-def test_the_example_is_a_loader(tmp_path: Path, images, camera_yaml: str, install: Callable[[Path], str]) -> None:
+def test_the_example_is_a_loader(
+    tmp_path: Path, images, camera_yaml: str, install: Callable[[Path], str]
+) -> None:
     code = install(DOCS / "design" / "loaders.md")
-    assert len([line for line in code.splitlines() if line and not line.startswith(("import", "from", '"""'))]) <= 30
+    assert (
+        len(
+            [
+                line
+                for line in code.splitlines()
+                if line and not line.startswith(("import", "from", '"""'))
+            ]
+        )
+        <= 30
+    )
     drive = tmp_path / "monday"
     images(drive / "left", [f"{k}.png" for k in range(4)])
     (drive / "left/1.png").unlink()
-    (drive / "drive.csv").write_text("".join(f"left/{k}.png,{10 + 0.1 * k},0,0,{k},0,0,0,1\n" for k in range(4)))
+    (drive / "drive.csv").write_text(
+        "".join(f"left/{k}.png,{10 + 0.1 * k},0,0,{k},0,0,0,1\n" for k in range(4))
+    )
     (drive / "camera.yaml").write_text(camera_yaml)
     sequence = open_sequence(drive)
     assert sequence.stamps == pytest.approx([10, 10.1, 10.2, 10.3])
-    assert sequence.reference is not None and sequence.reference[:, 2, 3] == pytest.approx(np.arange(4))
+    assert sequence.reference is not None and sequence.reference[:, 2, 3] == pytest.approx(
+        np.arange(4)
+    )
     assert sequence.frame(2).image[0, 0, 0] == 20
     with pytest.raises(MissingFrameError, match=r"no image 1\.png"):
         sequence.frame(1)
     line = examine(drive)[-1]
-    assert line.startswith("ok       sequence monday: 4 frames of 40x24, true poses") and line.endswith("(our drives)")
+    assert line.startswith(
+        "ok       sequence monday: 4 frames of 40x24, true poses"
+    ) and line.endswith("(our drives)")
 
 
 def test_the_example_is_a_source_of_depth(install: Callable[[Path], str]) -> None:

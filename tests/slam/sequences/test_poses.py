@@ -36,7 +36,9 @@ def recording(tmp_path: Path) -> Path:
     folder.mkdir(parents=True)
     for k in range(FRAMES):
         cv2.imwrite(str(folder / f"{k:03d}.png"), np.full((48, 64, 3), 10 * k, np.uint8))
-    (folder / "camera.yaml").write_text("{width: 64, height: 48, fx: 50, fy: 50, cx: 31.5, cy: 23.5, fps: 10}")
+    (folder / "camera.yaml").write_text(
+        "{width: 64, height: 48, fx: 50, fy: 50, cx: 31.5, cy: 23.5, fps: 10}"
+    )
     return folder
 
 
@@ -90,11 +92,16 @@ def tum_rows() -> list[list[str]]:
     """Words of a file of all frames at 10 a second, the camera's rate."""
     poses = true_poses()
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-    return [[f"{0.1 * k:.6f}", *map(repr, map(float, [*poses[k, :3, 3], *quaternions[k]]))] for k in range(FRAMES)]
+    return [
+        [f"{0.1 * k:.6f}", *map(repr, map(float, [*poses[k, :3, 3], *quaternions[k]]))]
+        for k in range(FRAMES)
+    ]
 
 
 @pytest.mark.parametrize("wrong", ["nan", "cut off", "swapped", "reversed", "semicolons"])
-def test_a_table_that_is_slightly_wrong_costs_no_reference(recording: Path, truth: Path, wrong: str) -> None:
+def test_a_table_that_is_slightly_wrong_costs_no_reference(
+    recording: Path, truth: Path, wrong: str
+) -> None:
     rows = tum_rows()
     match wrong:
         case "nan":
@@ -111,10 +118,14 @@ def test_a_table_that_is_slightly_wrong_costs_no_reference(recording: Path, trut
     np.testing.assert_allclose(found, true_poses(), atol=0.03)
 
 
-def test_stamps_in_another_unit_are_named_and_divided_they_fit(recording: Path, truth: Path) -> None:
+def test_stamps_in_another_unit_are_named_and_divided_they_fit(
+    recording: Path, truth: Path
+) -> None:
     rows = tum_rows()
     truth.write_text("\n".join(" ".join([f"{1e6 * float(t):.1f}", *others]) for t, *others in rows))
-    with pytest.raises(SequenceError, match=r"look like microseconds: divide them by 1e\+06") as caught:
+    with pytest.raises(
+        SequenceError, match=r"look like microseconds: divide them by 1e\+06"
+    ) as caught:
         reference(recording, truth)
     by = float(str(caught.value).rpartition(" ")[2])
     table = np.loadtxt(truth)
@@ -159,7 +170,10 @@ def test_nmea_around_midnight_and_without_an_altitude(tmp_path: Path) -> None:
         ("stamp,latitude,longitude,altitude\n0,95,8,100\n", "line 2: no GPS fix"),
         ("stamp,latitude,longitude,altitude\n0,x,8,100\n", "line 2: no GPS fix"),
         ("stamp,latitude,longitude,altitude\n1,49,8,100\n1,49,8,100\n", "stamps must increase"),
-        ("stamp,latitude,longitude,altitude\n1,49,8,100\n2,50,8,100\n3,51,8,100\n", "fixes move at 11119[45] m/s"),
+        (
+            "stamp,latitude,longitude,altitude\n1,49,8,100\n2,50,8,100\n3,51,8,100\n",
+            "fixes move at 11119[45] m/s",
+        ),
         ("$GPGGA,123519,48x07.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,", "line 1: no GPS fix"),
     ],
 )

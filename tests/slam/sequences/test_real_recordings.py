@@ -23,7 +23,9 @@ RECORDINGS = [
 
 
 @pytest.mark.parametrize("path, name, frames, length_m, height_m", RECORDINGS)
-def test_opens(data_root: Path, path: str, name: str | None, frames: int, length_m: float | None, height_m) -> None:
+def test_opens(
+    data_root: Path, path: str, name: str | None, frames: int, length_m: float | None, height_m
+) -> None:
     sequence = open_sequence(data_root / path, name, None, None)
     assert len(sequence) == frames == len(sequence.stamps)
     K = sequence.intrinsics

@@ -9,7 +9,14 @@ from slam.simulation.options import SimulationOptions
 
 @pytest.mark.parametrize(
     "text, wanted",
-    [("0:10", (0, 10)), (":4", (0, 4)), ("3:", (3, 10)), (":", (0, 10)), ("-4:-1", (6, 9)), (" 2 : 5 ", (2, 5))],
+    [
+        ("0:10", (0, 10)),
+        (":4", (0, 4)),
+        ("3:", (3, 10)),
+        (":", (0, 10)),
+        ("-4:-1", (6, 9)),
+        (" 2 : 5 ", (2, 5)),
+    ],
 )
 def test_ranges(text: str, wanted: tuple[int, int]) -> None:
     assert frame_range(text, 10) == wanted
@@ -35,7 +42,9 @@ def test_rebased_is_rigid_and_starts_at_the_identity() -> None:
 
 @pytest.fixture(scope="module")
 def simulated() -> SimulatedSequence:
-    return SimulatedSequence(SimulationOptions(route="straight", frames=20, seed=1001, width=104, height=32))
+    return SimulatedSequence(
+        SimulationOptions(route="straight", frames=20, seed=1001, width=104, height=32)
+    )
 
 
 def test_is_a_sequence(simulated: SimulatedSequence) -> None:

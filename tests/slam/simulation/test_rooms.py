@@ -47,26 +47,40 @@ def test_depth_is_the_distance_to_the_surface_and_closes_the_room(walk: Simulate
     frame = walk.render(7)
     assert (frame.depth > 0).all() and frame.depth.max() < 50.0
     v, u = np.mgrid[0:72:5, 0:96:5].reshape(2, -1)
-    points = (np.linalg.inv(walk.K) @ np.stack([u, v, np.ones_like(u)])).T * frame.depth[v, u][:, None]
-    assert np.quantile(walk.distance_to_surface(se3.apply(frame.T_world_camera, points)), 0.99) < 1e-3
+    points = (np.linalg.inv(walk.K) @ np.stack([u, v, np.ones_like(u)])).T * frame.depth[v, u][
+        :, None
+    ]
+    assert (
+        np.quantile(walk.distance_to_surface(se3.apply(frame.T_world_camera, points)), 0.99) < 1e-3
+    )
     assert np.array_equal(walk.depth(7), frame.depth)
 
 
 @pytest.mark.parametrize("motion", get_args(Motion))
-def test_camera_keeps_clear_of_walls_and_furniture_and_turns_no_faster_than_asked(motion: Motion) -> None:
+def test_camera_keeps_clear_of_walls_and_furniture_and_turns_no_faster_than_asked(
+    motion: Motion,
+) -> None:
     world = rooms(600, 2, motion=motion, rate=5.0)
     step = np.linalg.norm(np.diff(world.T_world_camera[:, :3, 3], axis=0), axis=1)
     assert world.distance_to_surface(world.T_world_camera[::3, :3, 3]).min() >= 0.3
     assert step.sum() > 20.0 and step.max() < 0.4
     assert turns_deg(world).max() < 1.5 * FASTEST_TURN_DEG
-    assert se3.is_se3(world.T_world_camera, 1e-9) and np.array_equal(world.T_world_camera[0], np.eye(4))
+    assert se3.is_se3(world.T_world_camera, 1e-9) and np.array_equal(
+        world.T_world_camera[0], np.eye(4)
+    )
 
 
 def test_a_higher_rate_takes_more_images_of_slower_turns() -> None:
-    assert turns_deg(rooms(240, 2, motion="phone", rate=60.0)).max() < 5.0 < turns_deg(rooms(240, 2, rate=5.0)).max()
+    assert (
+        turns_deg(rooms(240, 2, motion="phone", rate=60.0)).max()
+        < 5.0
+        < turns_deg(rooms(240, 2, rate=5.0)).max()
+    )
 
 
-def test_same_options_give_the_same_bytes_and_other_seeds_another_house(walk: SimulatedRooms) -> None:
+def test_same_options_give_the_same_bytes_and_other_seeds_another_house(
+    walk: SimulatedRooms,
+) -> None:
     again, other = rooms(), rooms(seed=4)
     assert np.array_equal(again.T_world_camera, walk.T_world_camera)
     assert np.array_equal(again.render(9).image, walk.render(9).image)
@@ -76,7 +90,10 @@ def test_same_options_give_the_same_bytes_and_other_seeds_another_house(walk: Si
 @pytest.mark.parametrize("hazard", ["people", "exposure", "blur", "rolling-shutter"])
 def test_hazards_change_images_but_not_poses(walk: SimulatedRooms, hazard: str) -> None:
     world = rooms(hazards=(hazard,))
-    changed = [np.abs(world.render(k).image.astype(float) - walk.render(k).image).mean() for k in (5, 20, 40, 55)]
+    changed = [
+        np.abs(world.render(k).image.astype(float) - walk.render(k).image).mean()
+        for k in (5, 20, 40, 55)
+    ]
     assert max(changed) > 0.5
     assert np.array_equal(world.T_world_camera, walk.T_world_camera)
     if hazard != "people":
@@ -101,11 +118,17 @@ def test_a_root_on_disk_has_the_exact_surface(walk: SimulatedRooms, tmp_path: Pa
     short, root = rooms(4, rate=30.0), tmp_path / "world"
     write_kitti_root(short, root, depth=True, mesh=True)
     sequence = open_sequence(root)
-    assert sequence.stamps == pytest.approx(np.arange(4) / 30.0) and sequence.camera_height_m is None
+    assert (
+        sequence.stamps == pytest.approx(np.arange(4) / 30.0) and sequence.camera_height_m is None
+    )
     truth, embedded = find_truth(sequence), find_truth(SimulatedSequence(short.options))
     points = np.random.default_rng(0).uniform(-2.0, 2.0, (50, 3))
     for found in (truth, embedded):
-        assert not isinstance(found, str) and found.name == "exact surface" and found.distance is not None
+        assert (
+            not isinstance(found, str)
+            and found.name == "exact surface"
+            and found.distance is not None
+        )
         assert found.distance(points) == pytest.approx(short.distance_to_surface(points), abs=1e-4)
     assert len(truth.view(2).points) == len(embedded.view(2).points) > 1000  # type: ignore[union-attr]
     (root / "mesh.ply").unlink()

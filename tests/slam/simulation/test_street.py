@@ -25,7 +25,9 @@ def straight() -> SimulatedStreet:
 
 @pytest.fixture(scope="module")
 def traffic() -> SimulatedStreet:
-    return SimulatedStreet(SimulationOptions("straight", 60, 701, hazards=("moving-cars",), **SMALL))
+    return SimulatedStreet(
+        SimulationOptions("straight", 60, 701, hazards=("moving-cars",), **SMALL)
+    )
 
 
 def path_of(street: SimulatedStreet) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -62,7 +64,9 @@ def warp_error(street: SimulatedStreet, target: int, source: int) -> tuple[float
     with np.errstate(divide="ignore", invalid="ignore"):
         at = (moved[:2] / moved[2]).reshape(2, height, width).astype(np.float32)
     warped = cv2.remap(b.image, at[0], at[1], cv2.INTER_LINEAR)
-    inside = (at[0] >= 0) & (at[0] <= width - 1) & (at[1] >= 0) & (at[1] <= height - 1) & (a.depth > 0)
+    inside = (
+        (at[0] >= 0) & (at[0] <= width - 1) & (at[1] >= 0) & (at[1] <= height - 1) & (a.depth > 0)
+    )
     error = np.abs(warped.astype(float) - a.image).mean(axis=2)[inside]
     unmoved = np.abs(b.image.astype(float) - a.image).mean(axis=2)[inside]
     return float(np.median(error)), float(np.median(unmoved))
@@ -76,7 +80,9 @@ def test_poses_start_at_the_world_and_keep_clear_of_everything_above_the_road(ro
     assert se3.is_se3(street.T_world_camera, 1e-9)
     step = np.linalg.norm(np.diff(street.T_world_camera[:, :3, 3], axis=0), axis=1)
     assert step.min() > 0.45 and step.max() < 1.5 and 0.6 < step.mean() < 1.2
-    turn = se3.rotation_angle(se3.invert(street.T_world_camera[:-1])[:, :3, :3] @ street.T_world_camera[1:, :3, :3])
+    turn = se3.rotation_angle(
+        se3.invert(street.T_world_camera[:-1])[:, :3, :3] @ street.T_world_camera[1:, :3, :3]
+    )
     assert np.rad2deg(turn.max()) < 7.0
     assert street.T_world_camera[5, 2, 3] > 2.0  # forward is z
     assert 1.5 <= street.camera_height_m <= 1.8
@@ -97,7 +103,9 @@ def test_loop_revisits_its_start_and_turns_left_and_right(frames: int, seed: int
 
 
 def test_grid_is_revisited_in_both_directions() -> None:
-    again = np.array([revisited(SimulatedStreet(SimulationOptions("grid", 800, s)), 5.5) for s in (705, 706)])
+    again = np.array(
+        [revisited(SimulatedStreet(SimulationOptions("grid", 800, s)), 5.5) for s in (705, 706)]
+    )
     assert (again[:, 0] > 20.0).all() and (again[:, 1] > 20.0).all()
 
 
@@ -117,7 +125,9 @@ def test_depth_is_the_distance_to_the_surface(straight: SimulatedStreet) -> None
     assert np.quantile(straight.distance_to_surface(points), 0.99) < 1e-3
 
 
-def test_same_options_give_the_same_bytes_and_other_seeds_another_world(straight: SimulatedStreet) -> None:
+def test_same_options_give_the_same_bytes_and_other_seeds_another_world(
+    straight: SimulatedStreet,
+) -> None:
     again = SimulatedStreet(straight.options)
     assert np.array_equal(again.T_world_camera, straight.T_world_camera)
     assert np.array_equal(again.render(9).image, straight.render(9).image)
@@ -147,7 +157,10 @@ def test_scans_lie_on_surfaces_and_spin_freely(straight: SimulatedStreet) -> Non
     assert np.quantile(straight.distance_to_surface(points_world), 0.99) < 0.1
     assert abs(np.median(scan[scan[:, 2] < -1.0, 2]) + straight.camera_height_m + 0.08) < 0.15
     spacing = 2 * np.pi / 850
-    phases = [np.angle(np.exp(2j * np.pi * np.arctan2(s[:, 1], s[:, 0]) / spacing).mean()) for s in (scan, following)]
+    phases = [
+        np.angle(np.exp(2j * np.pi * np.arctan2(s[:, 1], s[:, 0]) / spacing).mean())
+        for s in (scan, following)
+    ]
     assert abs(np.exp(1j * phases[0]) - np.exp(1j * phases[1])) > 0.01
 
 
@@ -166,20 +179,31 @@ def test_kitti_root_holds_what_was_rendered(tmp_path: Path) -> None:
     root, written = tmp_path / "deep" / "world", []
     write_kitti_root(street, root, depth=True, lidar=True, progress=written.append)
     assert written == [1, 2, 3]
-    assert sorted(p.name for p in root.iterdir()) == ["camera.yaml", "poses", "sequences", "simulation.json"]
+    assert sorted(p.name for p in root.iterdir()) == [
+        "camera.yaml",
+        "poses",
+        "sequences",
+        "simulation.json",
+    ]
     sequence, frame = root / "sequences" / "sim", street.render(2)
-    assert np.array_equal(cv2.imread(str(sequence / "image_2" / "000002.png"))[..., ::-1], frame.image)
+    assert np.array_equal(
+        cv2.imread(str(sequence / "image_2" / "000002.png"))[..., ::-1], frame.image
+    )
     encoded = cv2.imread(str(sequence / "depth_2" / "000002.png"), cv2.IMREAD_UNCHANGED)
     assert encoded.dtype == np.uint16 and ((encoded == 0) == (frame.depth == 0)).all()
     assert np.abs(encoded / 256.0 - frame.depth).max() <= 0.5 / 256 + 1e-6
     scan = np.fromfile(sequence / "velodyne" / "000001.bin", np.float32).reshape(-1, 4)
     assert np.array_equal(scan, street.scan(1))
     assert np.loadtxt(sequence / "times.txt") == pytest.approx([0.0, 0.1, 0.2])
-    assert np.loadtxt(root / "poses" / "sim.txt").reshape(3, 3, 4) == pytest.approx(street.T_world_camera[:, :3])
+    assert np.loadtxt(root / "poses" / "sim.txt").reshape(3, 3, 4) == pytest.approx(
+        street.T_world_camera[:, :3]
+    )
     rows = dict(line.split(": ") for line in (sequence / "calib.txt").read_text().splitlines())
     assert list(rows) == ["P0", "P1", "P2", "P3", "Tr"] and rows["P0"] == rows["P2"]
     assert np.fromstring(rows["P2"], sep=" ").reshape(3, 4)[:, :3] == pytest.approx(street.K)
-    assert np.fromstring(rows["Tr"], sep=" ").reshape(3, 4) == pytest.approx(street.T_camera_lidar[:3])
+    assert np.fromstring(rows["Tr"], sep=" ").reshape(3, 4) == pytest.approx(
+        street.T_camera_lidar[:3]
+    )
     camera = yaml.safe_load((root / "camera.yaml").read_text())
     assert (camera["width"], camera["height"], camera["model"]) == (208, 64, "pinhole")
     assert camera["camera_height_m"] == pytest.approx(street.camera_height_m)
@@ -190,19 +214,30 @@ def test_kitti_root_holds_what_was_rendered(tmp_path: Path) -> None:
 
 CAMERA = Intrinsics(64, 32, 100.0, 50.0, 31.5, 15.5)
 # a camera that looks east: right is south, down is down
-T_SCENE_CAMERA = se3.make(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.0, 0.0, 1.5]))
+T_SCENE_CAMERA = se3.make(
+    np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.0, 0.0, 1.5])
+)
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.1, -0.1])
 def test_depth_of_a_slope_is_that_of_hand(slope: float) -> None:
     soup = Soup(np.random.default_rng(0))
     ground = soup.instance(Material.ASPHALT, np.full(3, 0.3))
-    soup.quad(np.array([0.0, -500.0, 0.0]), np.array([900.0, 0.0, 900.0 * slope]), np.array([0.0, 1000.0, 0.0]), ground)
-    rays = place_rays(T_SCENE_CAMERA, CAMERA.rays(CAMERA.pixel_grid()).reshape(-1, 3).astype(np.float32))
+    soup.quad(
+        np.array([0.0, -500.0, 0.0]),
+        np.array([900.0, 0.0, 900.0 * slope]),
+        np.array([0.0, 1000.0, 0.0]),
+        ground,
+    )
+    rays = place_rays(
+        T_SCENE_CAMERA, CAMERA.rays(CAMERA.pixel_grid()).reshape(-1, 3).astype(np.float32)
+    )
     depth = Surface(soup.finish(FLAT)).cast(rays)["t_hit"].reshape(32, 64)
     row = np.arange(22, 32)
     expected = 1.5 / ((row - 15.5) / 50.0 + slope)  # 1.5 - depth (v - cy) / fy = slope depth
-    np.testing.assert_allclose(depth[22:], np.where(expected > 0.0, expected, np.inf)[:, None].repeat(64, 1), rtol=1e-5)
+    np.testing.assert_allclose(
+        depth[22:], np.where(expected > 0.0, expected, np.inf)[:, None].repeat(64, 1), rtol=1e-5
+    )
 
 
 def test_varieties_cover_streets_and_cameras() -> None:
@@ -214,13 +249,18 @@ def test_varieties_cover_streets_and_cameras() -> None:
         ([np.rad2deg(one.roll) for one in drawn], -2.0, 2.0),
         ([one.steepness for one in drawn], 0.0, 0.1),
     ):
-        assert low <= min(values) < low + 0.1 * (high - low) and high - 0.1 * (high - low) < max(values) <= high
+        assert (
+            low <= min(values) < low + 0.1 * (high - low)
+            and high - 0.1 * (high - low) < max(values) <= high
+        )
     assert 0.1 < np.mean([one.bonnet > 0.0 for one in drawn]) < 0.4
     assert all(draw_variety(seed, lone_road=False).kind != "motorway" for seed in range(60))
 
 
 def test_a_camera_keeps_its_field_of_view_when_its_image_is_shrunk() -> None:
-    one = next(one for one in (draw_variety(seed, True) for seed in range(50)) if one.aspect is not None)
+    one = next(
+        one for one in (draw_variety(seed, True) for seed in range(50)) if one.aspect is not None
+    )
     K = one.camera(416, 128).K
     assert 2.0 * np.rad2deg(np.arctan(208.0 / K[0, 0])) == pytest.approx(one.fov_deg)
     assert K[1, 1] / K[0, 0] == pytest.approx(one.aspect * 128 / 416)
@@ -235,7 +275,14 @@ def test_sunny_streets_saturate_a_little_and_shadows_are_deep() -> None:
         if weather.saturated >= 0.04:
             road_in_sun = weather.sunshine * weather.sun[2] + weather.ambient
             assert 3.0 <= road_in_sun / weather.ambient <= 10.0 + 1e-6
-            shares.append(np.mean([(street.render(index).image.max(axis=2) >= 254).mean() for index in (0, 15, 29)]))
+            shares.append(
+                np.mean(
+                    [
+                        (street.render(index).image.max(axis=2) >= 254).mean()
+                        for index in (0, 15, 29)
+                    ]
+                )
+            )
         steepest = max(steepest, np.abs(np.diff(street.T_world_camera[:, 1, 3])).max())
     assert len(shares) >= 3 and 0.02 < np.mean(shares) < 0.15
     assert steepest > 0.03

@@ -9,7 +9,12 @@ from pathlib import Path
 import pytest
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.camera_file import Pinhole, impossible, read_camera_file, require_plausible
+from erfsfm.common.readers.camera_file import (
+    Pinhole,
+    impossible,
+    read_camera_file,
+    require_plausible,
+)
 from erfsfm.geometry import Camera
 from slam.frames import Intrinsics
 
@@ -46,11 +51,16 @@ def test_reads(tmp_path: Path, camera_yaml: str, line: str, height: float | None
         ("{yaml}readout_ms: 201\n", "readout_ms: at most 200, the time of a frame; is 201"),
         ("{yaml}model: omni\n", "model: Input should be 'pinhole', 'opencv', 'fisheye' or 'fov'"),
         ("{yaml}distortion: [0.1, 0, 0, 0]\n", "distortion: needs model opencv, fisheye or fov"),
-        ("{yaml}model: opencv\ndistortion: [0.1]\n", "model opencv has 4 or 5 or 8 or 12 or 14 numbers, not 1"),
+        (
+            "{yaml}model: opencv\ndistortion: [0.1]\n",
+            "model opencv has 4 or 5 or 8 or 12 or 14 numbers, not 1",
+        ),
         ("{yaml}model: fisheye\n", "model fisheye has 4 numbers, not 0"),
     ],
 )
-def test_errors_are_one_line_and_name_the_key(tmp_path: Path, camera_yaml: str, text: str, message: str) -> None:
+def test_errors_are_one_line_and_name_the_key(
+    tmp_path: Path, camera_yaml: str, text: str, message: str
+) -> None:
     path = written(tmp_path, text.replace("{yaml}", camera_yaml))
     with pytest.raises(DataError) as caught:
         read_camera_file(path)
@@ -65,7 +75,14 @@ KITTI = Pinhole(1241, 376, 718.856, 718.856, 607.1928, 185.2157)
 def test_both_packages_resize_in_the_same_way(kind: type[Pinhole]) -> None:
     half = kind.of(Pinhole(100, 60, 80.0, 82.0, 49.5, 29.5)).resized(50, 30)
     assert type(half) is kind
-    assert (half.width, half.height, half.fx, half.fy, half.cx, half.cy) == (50, 30, 40, 41, 24.5, 14.5)
+    assert (half.width, half.height, half.fx, half.fy, half.cx, half.cy) == (
+        50,
+        30,
+        40,
+        41,
+        24.5,
+        14.5,
+    )
     assert half.K[0].tolist() == [40, 0, 24.5]
 
 
@@ -79,7 +96,9 @@ def test_both_packages_resize_in_the_same_way(kind: type[Pinhole]) -> None:
     ],
     ids=["KITTI", "telephoto", "fisheye", "upright"],
 )
-def test_real_cameras_pass_without_a_warning(camera: Pinhole, caplog: pytest.LogCaptureFixture) -> None:
+def test_real_cameras_pass_without_a_warning(
+    camera: Pinhole, caplog: pytest.LogCaptureFixture
+) -> None:
     with caplog.at_level(logging.WARNING):
         require_plausible(camera, "here")
     assert impossible(camera) is None and not caplog.records

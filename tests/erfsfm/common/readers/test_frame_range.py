@@ -50,7 +50,10 @@ def test_leaks(name: str, seen: str, leaks: bool) -> None:
 @pytest.mark.parametrize("sequence", sorted(ODOMETRY_DRIVES))
 def test_every_odometry_sequence_is_its_raw_drive(sequence: str) -> None:
     drive, first, past_last = ODOMETRY_DRIVES[sequence]
-    cut, whole = FrameRange.parse(f"kitti_raw/{drive}[{first}:{past_last}]"), FrameRange.parse(f"kitti_raw/{drive}")
+    cut, whole = (
+        FrameRange.parse(f"kitti_raw/{drive}[{first}:{past_last}]"),
+        FrameRange.parse(f"kitti_raw/{drive}"),
+    )
     name = f"kitti_odometry/{sequence}"
     assert cut.counted_in(name) == whole.counted_in(name) == FrameRange(name, 0, past_last - first)
     assert FrameRange.parse(name).counted_in(cut.recording) == cut
@@ -59,9 +62,21 @@ def test_every_odometry_sequence_is_its_raw_drive(sequence: str) -> None:
 @pytest.mark.parametrize(
     ("name", "recording", "same"),
     [
-        ("kitti_raw/2011_09_30_drive_0028[1000:1200]", "kitti_odometry/08", "kitti_odometry/08[0:100]"),
-        ("kitti_odometry/08[0:100]", "kitti_raw/2011_09_30_drive_0028", "kitti_raw/2011_09_30_drive_0028[1100:1200]"),
-        ("kitti_raw/2011_09_30_drive_0028[5000:]", "kitti_odometry/08", "kitti_odometry/08[3900:4071]"),
+        (
+            "kitti_raw/2011_09_30_drive_0028[1000:1200]",
+            "kitti_odometry/08",
+            "kitti_odometry/08[0:100]",
+        ),
+        (
+            "kitti_odometry/08[0:100]",
+            "kitti_raw/2011_09_30_drive_0028",
+            "kitti_raw/2011_09_30_drive_0028[1100:1200]",
+        ),
+        (
+            "kitti_raw/2011_09_30_drive_0028[5000:]",
+            "kitti_odometry/08",
+            "kitti_odometry/08[3900:4071]",
+        ),
         ("kitti_raw/2011_09_30_drive_0028[0:1100]", "kitti_odometry/08", None),
         ("simulated/500-599[10:]", "simulated/512", "simulated/512[10:]"),
         ("simulated/500-599", "simulated/499", None),
@@ -74,6 +89,14 @@ def test_the_same_frames_by_other_numbers(name: str, recording: str, same: str |
 
 
 def test_merge() -> None:
-    names = ["simulated/3", "simulated/1", "simulated/2", "simulated/7", "folder/b", "folder/a", "folder/b"]
+    names = [
+        "simulated/3",
+        "simulated/1",
+        "simulated/2",
+        "simulated/7",
+        "folder/b",
+        "folder/a",
+        "folder/b",
+    ]
     assert merge(names) == ["simulated/1-3", "simulated/7", "folder/a", "folder/b"]
     assert merge([]) == []

@@ -11,7 +11,14 @@ import numpy as np
 import pytest
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.images import has_images, list_images, read_image, read_values, resize_image, stretch_of
+from erfsfm.common.readers.images import (
+    has_images,
+    list_images,
+    read_image,
+    read_values,
+    resize_image,
+    stretch_of,
+)
 
 
 def test_reads_rgb_not_bgr(tmp_path: Path) -> None:
@@ -25,7 +32,9 @@ def test_reads_rgb_not_bgr(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("dtype, value", [(np.uint8, 77), (np.uint16, 77 * 256)])
-def test_grey_and_16_bit_images_become_three_channels(tmp_path: Path, dtype: type, value: int) -> None:
+def test_grey_and_16_bit_images_become_three_channels(
+    tmp_path: Path, dtype: type, value: int
+) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.full((4, 6), value, dtype))
     assert (read_image(tmp_path / "a.png") == 77).all()
     assert read_image(tmp_path / "a.png").shape == (4, 6, 3)
@@ -87,7 +96,10 @@ def test_more_pixels_than_can_be_are_not_taken_from_memory(tmp_path: Path) -> No
     _, content = cv2.imencode(".png", np.zeros((8, 8), np.uint8))
     header = b"IHDR" + struct.pack(">II", 32_000, 32_000) + content.tobytes()[24:29]
     (tmp_path / "a.png").write_bytes(
-        content.tobytes()[:12] + header + struct.pack(">I", zlib.crc32(header)) + content.tobytes()[33:]
+        content.tobytes()[:12]
+        + header
+        + struct.pack(">I", zlib.crc32(header))
+        + content.tobytes()[33:]
     )
     with pytest.raises(DataError, match=r"a\.png has more pixels than any camera"):
         read_image(tmp_path / "a.png")

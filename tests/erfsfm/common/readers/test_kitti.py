@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.kitti import CalibrationFile, drive_name, find_drives, find_odometry_root, odometry_camera
+from erfsfm.common.readers.kitti import (
+    CalibrationFile,
+    drive_name,
+    find_drives,
+    find_odometry_root,
+    odometry_camera,
+)
 from slam.geometry import se3
 from slam.geometry.se3 import invert
 
@@ -32,11 +38,18 @@ def test_odometry_roots(tmp_path: Path, given: str) -> None:
 
 def test_drives(tmp_path: Path) -> None:
     date = tmp_path / "2011_09_26"
-    for name in ("2011_09_26_drive_0002_sync", "2011_09_26_drive_0001_sync", "2011_09_26_drive_0003_extract", "other"):
+    for name in (
+        "2011_09_26_drive_0002_sync",
+        "2011_09_26_drive_0001_sync",
+        "2011_09_26_drive_0003_extract",
+        "other",
+    ):
         (date / name).mkdir(parents=True)
     names = ["2011_09_26_drive_0001", "2011_09_26_drive_0002"]
     assert list(find_drives(tmp_path)) == list(find_drives(date)) == names
-    assert find_drives(date / "2011_09_26_drive_0001_sync") == {names[0]: date / "2011_09_26_drive_0001_sync"}
+    assert find_drives(date / "2011_09_26_drive_0001_sync") == {
+        names[0]: date / "2011_09_26_drive_0001_sync"
+    }
     assert find_drives(date / "other") == {}
     assert drive_name("2011_09_26/2011_09_26_drive_0001_sync") == names[0]
     with pytest.raises(DataError, match="is not rectified"):

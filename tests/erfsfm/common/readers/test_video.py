@@ -40,7 +40,9 @@ def write_video(path: Path, frames: int = FRAMES) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("suffix", "counted_frames"), [*((suffix, 3000) for suffix in FORMATS), (".avi", 10)])
+@pytest.mark.parametrize(
+    ("suffix", "counted_frames"), [*((suffix, 3000) for suffix in FORMATS), (".avi", 10)]
+)
 def test_any_order_gives_the_right_frame(tmp_path: Path, suffix: str, counted_frames: int) -> None:
     """Also of a long one, whose frames are not counted."""
     frames = VideoFrames(write_video(tmp_path / f"a{suffix}"), counted_frames)
@@ -49,7 +51,9 @@ def test_any_order_gives_the_right_frame(tmp_path: Path, suffix: str, counted_fr
         assert decoded(frames.read(index)) == index
 
 
-def test_an_uncounted_video_is_decoded_once_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_uncounted_video_is_decoded_once_in_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     called, opened = [], cv2.VideoCapture
 
     class Watched:
@@ -79,6 +83,8 @@ def test_a_damaged_video_is_one_line_in_a_process_of_its_own(tmp_path: Path) -> 
         "from erfsfm.common.readers.video import VideoFrames\n"
         "try:\n    VideoFrames(Path(sys.argv[1]))\nexcept DataError as error:\n    print(error, file=sys.stderr)"
     )
-    answer = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
+    answer = subprocess.run(
+        [sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True
+    )
     (line,) = answer.stderr.splitlines()
     assert "a.mp4 cannot be opened: copy it again" in line

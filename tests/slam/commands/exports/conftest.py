@@ -23,12 +23,19 @@ CAMERA = Intrinsics(80, 48, 60.0, 61.0, 40.5, 22.25)
 FRAMES = 8
 
 
-def wavy(rows: int = 30, columns: int = 20, pitch: float = 0.1) -> tuple[FloatArray, np.ndarray[Any, Any]]:
+def wavy(
+    rows: int = 30, columns: int = 20, pitch: float = 0.1
+) -> tuple[FloatArray, np.ndarray[Any, Any]]:
     """Points of a sheet and its triangles."""
     i, j = (each.ravel() for each in np.mgrid[:rows, :columns])
-    points = np.column_stack([j * pitch, 1.5 + 0.02 * np.sin(0.7 * i + j), 2 + i * pitch]).astype(np.float32)
+    points = np.column_stack([j * pitch, 1.5 + 0.02 * np.sin(0.7 * i + j), 2 + i * pitch]).astype(
+        np.float32
+    )
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
-    halves = [[corner, corner + 1, corner + columns], [corner + 1, corner + columns + 1, corner + columns]]
+    halves = [
+        [corner, corner + 1, corner + columns],
+        [corner + 1, corner + columns + 1, corner + columns],
+    ]
     triangles = np.concatenate([np.stack(half, axis=1) for half in halves])
     return points.astype(np.float64), triangles
 
@@ -42,7 +49,9 @@ def sheet() -> Ply:
 
 
 @pytest.fixture
-def make_recorded(tmp_path: Path, make_run: Callable[..., RunFolder], sheet: Ply) -> Callable[..., RunFolder]:
+def make_recorded(
+    tmp_path: Path, make_run: Callable[..., RunFolder], sheet: Ply
+) -> Callable[..., RunFolder]:
     """Builds a run of a folder of images: eight frames, of which ``broken`` cannot be read."""
 
     def make(broken: tuple[int, ...] = (), bridged: tuple[int, ...] = ()) -> RunFolder:
@@ -61,7 +70,10 @@ def make_recorded(tmp_path: Path, make_run: Callable[..., RunFolder], sheet: Ply
             "schema": 1,
             "status": "ok",
             "provenance": {"recording": {"dataset": str(images)}},
-            "sequence": {"frames": FRAMES, "bridged": [{"first": k, "last": k, "reason": "blank"} for k in bridged]},
+            "sequence": {
+                "frames": FRAMES,
+                "bridged": [{"first": k, "last": k, "reason": "blank"} for k in bridged],
+            },
             "scale": {"mode": "camera-height", "value": 1.0},
         }
         folder = make_run("recorded", metrics)

@@ -38,7 +38,9 @@ def run(make_run: Callable[..., RunFolder], street: SimulatedSequence) -> RunFol
     folder.write(PLACES, Places(street.intrinsics, views, street.reference[::STRIDE]).write)
     folder.write_trajectory("optimised", Trajectory(0.1 * np.arange(FRAMES), street.reference))
     folder.write_metrics(
-        folder.metrics().changed(sequence=folder.metrics().sequence.model_copy(update={"frames": FRAMES}))
+        folder.metrics().changed(
+            sequence=folder.metrics().sequence.model_copy(update={"frames": FRAMES})
+        )
     )
     (folder.path / "map_cloud.ply").unlink()
     return folder
@@ -63,7 +65,9 @@ def test_corners_are_tracked_through_the_images(
             corners = images[2 * image - 1]
             u, v, number = corners[3 * corner : 3 * corner + 3]
             assert int(number) == k + 1
-            projected = street.intrinsics.project(apply(invert(street.reference[image - 1]), X[k][None]))[0]
+            projected = street.intrinsics.project(
+                apply(invert(street.reference[image - 1]), X[k][None])
+            )[0]
             assert np.linalg.norm(projected + 0.5 - [float(u), float(v)]) < 4.0
             seen += 1
     assert seen >= 3 * len(points) == 3 * sum(len(point) >= 8 + 2 * 3 for point in points)

@@ -21,13 +21,17 @@ MakeRun = Callable[..., RunFolder]
 
 
 @pytest.mark.parametrize("what", ["mesh", "cloud"])
-def test_ply_is_written_as_it_is_or_rotated_into_a_new_folder(make_run: MakeRun, tmp_path: Path, what: str) -> None:
+def test_ply_is_written_as_it_is_or_rotated_into_a_new_folder(
+    make_run: MakeRun, tmp_path: Path, what: str
+) -> None:
     folder = make_run()
     source = folder.path / f"map_{what}.ply"
     copied = export(folder, what, tmp_path / "new" / "a.ply", "y-down")
     assert copied.read_bytes() == source.read_bytes()
     turned = export(folder, what, tmp_path / "new" / "b.ply", "z")
-    np.testing.assert_allclose(read_ply(turned).points[2], [0, 1, 2])  # the vertex 2 m above the road, (0, -2, 1)
+    np.testing.assert_allclose(
+        read_ply(turned).points[2], [0, 1, 2]
+    )  # the vertex 2 m above the road, (0, -2, 1)
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["a.ply", "b.ply"]
 
 
@@ -46,11 +50,15 @@ def test_colmap_has_camera_poses_and_cloud(make_run: MakeRun, tmp_path: Path, up
     folder = make_run()
     keep_places(folder)
     written = export(folder, "colmap", tmp_path / "new" / "model", up)
-    assert (written / "cameras.txt").read_text().splitlines()[1] == "1 PINHOLE 416 128 230.0 230.0 207.5 63.5"
+    assert (written / "cameras.txt").read_text().splitlines()[
+        1
+    ] == "1 PINHOLE 416 128 230.0 230.0 207.5 63.5"
     assert len((written / "images.txt").read_text().splitlines()) == 1 + 2 * 300
     third = (written / "points3D.txt").read_text().splitlines()[3]
     assert third == ("3 0 -2 1 128 128 128 0" if up == "y-down" else "3 0 1 2 128 128 128 0")
-    first = [float(word) for word in (written / "images.txt").read_text().splitlines()[1].split()[1:8]]
+    first = [
+        float(word) for word in (written / "images.txt").read_text().splitlines()[1].split()[1:8]
+    ]
     half = np.sqrt(0.5)  # z up: the camera's axes turned by 90 degrees about x
     expected = [1.0, 0, 0, 0, 0, 0, 0] if up == "y-down" else [half, half, 0, 0, 0, 0, 0]
     np.testing.assert_allclose(first, expected, atol=1e-9)
@@ -70,7 +78,9 @@ def test_colmap_has_camera_poses_and_cloud(make_run: MakeRun, tmp_path: Path, up
         ("colmap", "drive", "drive/images is none of ours"),
     ],
 )
-def test_nothing_else_is_replaced(make_run: MakeRun, tmp_path: Path, what: str, name: str, why: str) -> None:
+def test_nothing_else_is_replaced(
+    make_run: MakeRun, tmp_path: Path, what: str, name: str, why: str
+) -> None:
     folder = make_run()
     (tmp_path / "drive/images").mkdir(parents=True)
     (tmp_path / "folder.ply").mkdir()
@@ -85,7 +95,9 @@ def test_nothing_else_is_replaced(make_run: MakeRun, tmp_path: Path, what: str, 
 
 
 @pytest.mark.parametrize(("what", "missing"), [("mesh", "map_mesh.ply"), ("colmap", "places.npz")])
-def test_a_part_the_run_lacks_is_named(make_run: MakeRun, tmp_path: Path, what: str, missing: str) -> None:
+def test_a_part_the_run_lacks_is_named(
+    make_run: MakeRun, tmp_path: Path, what: str, missing: str
+) -> None:
     folder = make_run()
     keep_places(folder)
     (folder.path / missing).unlink()
@@ -107,7 +119,9 @@ def test_an_estimate_that_lacks_rows_is_not_exported(make_run: MakeRun, tmp_path
     keep_places(folder)
     path = folder.path / "trajectory_optimised.tum.txt"
     path.write_text("\n".join(path.read_text().splitlines()[:200]) + "\n")
-    with pytest.raises(RunError, match=r"trajectory_optimised\.tum\.txt is damaged: it has 199 rows for 300 frames"):
+    with pytest.raises(
+        RunError, match=r"trajectory_optimised\.tum\.txt is damaged: it has 199 rows for 300 frames"
+    ):
         export(folder, "colmap", tmp_path / "out", "y-down")
     assert not (tmp_path / "out").exists()
 
@@ -121,6 +135,9 @@ def test_a_grid_of_too_many_cells_is_one_line(make_recorded: MakeRun, tmp_path: 
 def test_an_empty_map_is_not_exported(make_recorded: MakeRun, tmp_path: Path) -> None:
     folder = make_recorded()
     nothing = np.zeros((0, 3))
-    write_ply(folder.path / "map_mesh.ply", coloured_ply(nothing, nothing, nothing, np.zeros((0, 3), np.int64)))
+    write_ply(
+        folder.path / "map_mesh.ply",
+        coloured_ply(nothing, nothing, nothing, np.zeros((0, 3), np.int64)),
+    )
     with pytest.raises(RunError, match="the map is empty"):
         export(folder, "mesh", tmp_path / "m.ply")

@@ -34,7 +34,10 @@ def sheet_of(points: FloatArray) -> Ply:
     """A grid of points ``(R, C, 3)`` as a mesh."""
     rows, columns = points.shape[:2]
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
-    halves = [[corner, corner + 1, corner + columns], [corner + 1, corner + columns + 1, corner + columns]]
+    halves = [
+        [corner, corner + 1, corner + columns],
+        [corner + 1, corner + columns + 1, corner + columns],
+    ]
     flat = points.reshape(-1, 3)
     shades = np.full(flat.shape, 0.5)
     triangles = np.concatenate([np.stack(half, axis=1) for half in halves])
@@ -43,7 +46,9 @@ def sheet_of(points: FloatArray) -> Ply:
 
 def together(*meshes: Ply) -> Ply:
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    triangles = [mesh.triangles + start for mesh, start in zip(meshes, starts) if mesh.triangles is not None]
+    triangles = [
+        mesh.triangles + start for mesh, start in zip(meshes, starts) if mesh.triangles is not None
+    ]
     return Ply(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(triangles))
 
 
@@ -55,7 +60,9 @@ def standing(x: float, y: tuple[float, float], foot: float, top: float) -> Ply:
 
 
 def level(x: tuple[float, float], y: tuple[float, float], above: float) -> Ply:
-    across, along = np.meshgrid(np.arange(x[0], x[1], 0.2), np.arange(y[0], y[1], 0.2), indexing="ij")
+    across, along = np.meshgrid(
+        np.arange(x[0], x[1], 0.2), np.arange(y[0], y[1], 0.2), indexing="ij"
+    )
     return sheet_of(np.stack([across, along, road(across, along) + above], axis=-1))
 
 
@@ -86,14 +93,18 @@ def test_the_ground_follows_slope_and_bank(street: tuple[Ply, FloatArray]) -> No
 
 
 @pytest.mark.parametrize(("resolution", "unit"), [(0.1, 1.0), (0.25, 1 / CAMERA_HEIGHT)])
-def test_what_is_free_and_what_is_occupied(street: tuple[Ply, FloatArray], resolution: float, unit: float) -> None:
+def test_what_is_free_and_what_is_occupied(
+    street: tuple[Ply, FloatArray], resolution: float, unit: float
+) -> None:
     mesh, poses = street
     vertices = mesh.vertices.copy()
     for axis in "xyz":
         vertices[axis] *= unit
     poses = poses.copy()
     poses[:, :3, 3] *= unit
-    values, corner = occupancy_grid(Ply(vertices, mesh.triangles), poses, resolution * unit, unit == 1.0)
+    values, corner = occupancy_grid(
+        Ply(vertices, mesh.triangles), poses, resolution * unit, unit == 1.0
+    )
     shape, corner, step = values.shape, corner / unit, resolution
 
     def cells(x: tuple[float, float], y: tuple[float, float]) -> np.ndarray:
@@ -110,12 +121,16 @@ def test_what_is_free_and_what_is_occupied(street: tuple[Ply, FloatArray], resol
     assert (values == OCCUPIED).sum() * step**2 == pytest.approx(2 * 4 + 60 * step, rel=0.15)
 
 
-def test_narrow_gaps_of_the_road_are_closed_and_wide_ones_unknown(street: tuple[Ply, FloatArray]) -> None:
+def test_narrow_gaps_of_the_road_are_closed_and_wide_ones_unknown(
+    street: tuple[Ply, FloatArray],
+) -> None:
     _, poses = street
     parts = [level((-3, 3.2), along, 0.0) for along in ((-1, 10), (10.2, 20), (21.5, 60))]
     values, _ = occupancy_grid(together(*parts), poses, 0.1, True)
     # the last rows of the parts lie at 9.8, 19.8 and 59.8
-    of_y = {y: values[len(values) - 1 - round((y + 1) / 0.1), 20:40] for y in (9.9, 10.1, 20.6, 30.0)}
+    of_y = {
+        y: values[len(values) - 1 - round((y + 1) / 0.1), 20:40] for y in (9.9, 10.1, 20.6, 30.0)
+    }
     expected = {9.9: {FREE}, 10.1: {FREE}, 20.6: {UNKNOWN}, 30.0: {FREE}}
     assert {y: set(row.tolist()) for y, row in of_y.items()} == expected
 
@@ -130,18 +145,24 @@ def test_large_triangles_leave_no_holes(street: tuple[Ply, FloatArray]) -> None:
     """Two triangles from 20 m on; before them a vertex every 0.2 m, by which the ground is known."""
     corners = np.array([[-5, 20, 0], [5, 20, 0], [5, 60, 0], [-5, 60, 0]], float)
     corners[:, 2] = -CAMERA_HEIGHT
-    floor = coloured_ply(corners, np.zeros((4, 3)), np.zeros((4, 3)), np.array([[0, 1, 2], [0, 2, 3]]))
+    floor = coloured_ply(
+        corners, np.zeros((4, 3)), np.zeros((4, 3)), np.array([[0, 1, 2], [0, 2, 3]])
+    )
     near = level((-5, 5.2), (-1, 20.2), 0.0)
     near.vertices["z"][:] = -CAMERA_HEIGHT
     poses = street[1].copy()
     poses[:, 2, 3] = 0.0
     values, _ = occupancy_grid(together(near, floor), poses, 0.07, True)
     rows = int(20 / 0.07)  # the ground is told as far as 12 camera heights from the last vertex
-    assert (values[-(rows + 150) : -rows] == FREE).mean() > 0.985  # the border cells are cut by the edge
+    assert (
+        values[-(rows + 150) : -rows] == FREE
+    ).mean() > 0.985  # the border cells are cut by the edge
 
 
 @pytest.mark.parametrize("name", ["map.yaml", "map.pgm"])
-def test_the_grid_of_a_run(make_recorded: Callable[..., RunFolder], tmp_path: Path, name: str) -> None:
+def test_the_grid_of_a_run(
+    make_recorded: Callable[..., RunFolder], tmp_path: Path, name: str
+) -> None:
     written = export(make_recorded(), "occupancy", tmp_path / "new" / name, "z", resolution=0.2)
     assert sorted(path.name for path in written.parent.iterdir()) == ["map.pgm", "map.yaml"]
     described = yaml.safe_load(written.read_text())
@@ -158,10 +179,14 @@ def test_a_grid_without_metres_says_so(
     folder, output = make_recorded(), tmp_path / "map.yaml"
     words = ["export", str(folder.path), "--what", "occupancy", "--output", str(output)]
     for unit, note in (("camera heights", True), ("metres", False)):
-        folder.write_metrics(folder.metrics().changed(scale=ScaleMetrics(mode="none", value=9.8, unit=unit)))
+        folder.write_metrics(
+            folder.metrics().changed(scale=ScaleMetrics(mode="none", value=9.8, unit=unit))
+        )
         app(words, standalone_mode=False)
         assert ("not in metres" in capsys.readouterr().out) == note
-        assert output.read_text().startswith(f"# lengths in {unit}\n") and yaml.safe_load(output.read_text())
+        assert output.read_text().startswith(f"# lengths in {unit}\n") and yaml.safe_load(
+            output.read_text()
+        )
     own = ScaleMetrics(mode="none", unit="the networks' own unit")
     folder.write_metrics(folder.metrics().changed(scale=own))
     with pytest.raises(RunError, match="need metres or camera heights"):

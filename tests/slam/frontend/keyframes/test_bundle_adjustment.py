@@ -18,18 +18,30 @@ def scene(
     centres = np.cumsum(rng.normal(0.0, 0.15, (cameras, 3)), axis=0)
     T_camera_world = invert(from_rotation_vector(rng.normal(0.0, 0.1, (cameras, 3)), centres))
     X = rng.uniform((-2.0, -2.0, 3.0), (2.0, 2.0, 6.0), (points, 3))
-    camera, point = (rows.ravel() for rows in np.meshgrid(range(cameras), range(points), indexing="ij"))
+    camera, point = (
+        rows.ravel() for rows in np.meshgrid(range(cameras), range(points), indexing="ij")
+    )
     seen = rng.random(len(camera)) < 2 / 3
     camera, point = camera[seen], point[seen]
-    places = np.concatenate([apply(T_camera_world[c], X[[p]]) for c, p in zip(camera, point, strict=True)])
+    places = np.concatenate(
+        [apply(T_camera_world[c], X[[p]]) for c, p in zip(camera, point, strict=True)]
+    )
     pixels = places @ INTRINSICS.K.T
     noise = rng.normal(0.0, noise_px, (len(camera), 2))
-    depth = np.where(rng.random(len(camera)) < 0.3, places[:, 2] * np.exp(rng.normal(0.0, depth_sigma)), np.nan)
+    depth = np.where(
+        rng.random(len(camera)) < 0.3, places[:, 2] * np.exp(rng.normal(0.0, depth_sigma)), np.nan
+    )
     sigma = np.full(len(camera), 0.3)
-    return T_camera_world, X, Sightings(camera, point, pixels[:, :2] / pixels[:, 2:] + noise, depth, sigma)
+    return (
+        T_camera_world,
+        X,
+        Sightings(camera, point, pixels[:, :2] / pixels[:, 2:] + noise, depth, sigma),
+    )
 
 
-def disturbed(T_camera_world: FloatArray, X: FloatArray, fixed: int) -> tuple[FloatArray, FloatArray]:
+def disturbed(
+    T_camera_world: FloatArray, X: FloatArray, fixed: int
+) -> tuple[FloatArray, FloatArray]:
     rng = np.random.default_rng(2)
     moved = T_camera_world.copy()
     small = from_rotation_vector(*rng.normal(0.0, 0.01, (2, len(moved) - fixed, 3)))
@@ -123,7 +135,9 @@ def test_a_turn_has_depth_by_its_prior() -> None:
 def chain(cameras: int) -> list[Part]:
     """Each camera shares points with the next three, the last with the first, too."""
     rng = np.random.default_rng(3)
-    groups = [np.arange(k, min(k + 4, cameras)) for k in range(cameras)] + [np.array([0, cameras - 1])]
+    groups = [np.arange(k, min(k + 4, cameras)) for k in range(cameras)] + [
+        np.array([0, cameras - 1])
+    ]
     factors = [rng.normal(size=(6 * len(group), 6 * len(group))) for group in groups]
     return [(group, A @ A.T) for group, A in zip(groups, factors, strict=True)]
 
@@ -133,7 +147,9 @@ def test_the_sum_of_the_parts_is_solved(cameras: int) -> None:
     parts = chain(cameras)
     S = np.zeros((cameras, 6, cameras, 6))
     for group, part in parts:
-        S[group[:, None], :, group[None]] += part.reshape(len(group), 6, len(group), 6).transpose(0, 2, 1, 3)
+        S[group[:, None], :, group[None]] += part.reshape(len(group), 6, len(group), 6).transpose(
+            0, 2, 1, 3
+        )
     side = np.random.default_rng(4).normal(size=(cameras, 6))
     found = solve_sum(parts, side)
     assert found is not None

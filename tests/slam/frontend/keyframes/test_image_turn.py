@@ -8,7 +8,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Grey, Intrinsics
-from slam.frontend.keyframes.image_turn import image_shift, image_turn, in_middle_row, measured_turn, small_image
+from slam.frontend.keyframes.image_turn import (
+    image_shift,
+    image_turn,
+    in_middle_row,
+    measured_turn,
+    small_image,
+)
 from slam.geometry.se3 import from_rotation_vector, rotation_angle
 
 CAMERA = Intrinsics(640, 480, 500.0, 500.0, 319.5, 239.5)
@@ -19,7 +25,9 @@ def stripes(seed: int) -> Grey:
     y, x = np.mgrid[:480, :640]
     wide = cv2.GaussianBlur(np.random.default_rng(seed).normal(size=(1, 640)), (0, 0), 15)
     blotches = cv2.GaussianBlur(np.random.default_rng(seed + 1).normal(size=(480, 640)), (0, 0), 25)
-    return np.asarray(120 + 0.05 * x + 60 * wide + 300 * blotches, np.uint8) + np.zeros_like(y, np.uint8)
+    return np.asarray(120 + 0.05 * x + 60 * wide + 300 * blotches, np.uint8) + np.zeros_like(
+        y, np.uint8
+    )
 
 
 def test_a_bare_wall_shows_how_the_camera_turned() -> None:

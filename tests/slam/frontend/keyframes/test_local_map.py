@@ -21,7 +21,9 @@ def seen(
     T, nothing = invert(T_world_camera), np.zeros((TRACKS, 32), np.uint8)
     x, y, z = apply(T, points).T
     pixels = np.column_stack([500 * x / z + 319.5, 500 * y / z + 239.5])
-    return TrackedKeyframe(index, T, np.arange(TRACKS), pixels, pixels, learned_unit * z, nothing, None)
+    return TrackedKeyframe(
+        index, T, np.arange(TRACKS), pixels, pixels, learned_unit * z, nothing, None
+    )
 
 
 def along(x: float) -> FloatArray:
@@ -41,7 +43,9 @@ def test_new_points_have_the_unit_of_those_with_parallax() -> None:
         local.add(seen(k, along(0.5 * k), points, learned))
     local.add_points(CAMERA)
     in_camera = apply(local.keyframes[-1].T_camera_world, points[KNOWN:])
-    np.testing.assert_allclose(apply(local.keyframes[-1].T_camera_world, local.points[KNOWN:]), in_camera, rtol=1e-9)
+    np.testing.assert_allclose(
+        apply(local.keyframes[-1].T_camera_world, local.points[KNOWN:]), in_camera, rtol=1e-9
+    )
     np.testing.assert_array_equal(local.points[:KNOWN], points[:KNOWN])
 
 

@@ -10,7 +10,14 @@ import room
 from slam.frames import KEYFRAME_SOURCE, Intrinsics
 from slam.frontend.keyframes.odometry import KeyframeOdometry, first_motion
 from slam.frontend.keyframes.relative_poses import KeyframePoses, chained, keyframe_poses
-from slam.geometry.se3 import FloatArray, apply, from_rotation_vector, invert, rotation_angle, umeyama
+from slam.geometry.se3 import (
+    FloatArray,
+    apply,
+    from_rotation_vector,
+    invert,
+    rotation_angle,
+    umeyama,
+)
 
 CAMERA = Intrinsics(640, 480, 500.0, 500.0, 319.5, 239.5)
 T_WORLD_NOW = from_rotation_vector(np.array([0.0, 0.02, 0.01]), np.array([0.25, 0.02, 0.05]))
@@ -45,7 +52,9 @@ def test_a_map_begins_on_a_plane(seed: int) -> None:
     truth = room.walk(30)
     T = chained(poses(room.tracked(truth, near=False, draws=seed)).poses)
     estimate = np.stack([T[k] for k in range(30)])
-    estimate = umeyama(truth[:, :3, 3], estimate[:, :3, 3], with_scale=True).apply_to_poses(estimate)
+    estimate = umeyama(truth[:, :3, 3], estimate[:, :3, 3], with_scale=True).apply_to_poses(
+        estimate
+    )
     turned = rotation_angle(np.swapaxes(estimate[:, :3, :3], 1, 2) @ truth[:, :3, :3])
     assert np.rad2deg(turned).max() < 1.5
 
@@ -82,7 +91,9 @@ def test_another_scene_begins_another_map() -> None:
     assert len(set(found.segments.values())) == 2
     assert max(frame for frame, number in found.segments.items() if number == 0) < 25
     assert not any(pose.from_index < 25 <= pose.to_index for pose in found.poses)
-    images = [[keyframe.grey is not None for keyframe in segment.keyframes] for segment in state.segments]
+    images = [
+        [keyframe.grey is not None for keyframe in segment.keyframes] for segment in state.segments
+    ]
     assert not any(images[0]) and any(images[1])
 
 
@@ -106,7 +117,9 @@ def test_without_learned_depth_there_is_no_map() -> None:
     for k, T in enumerate(room.walk(6)):
         view = room.frame(k, T)
         odometry.follow(view)
-        odometry.learn(view, np.full((room.INTRINSICS.height, room.INTRINSICS.width), np.nan, np.float32))
+        odometry.learn(
+            view, np.full((room.INTRINSICS.height, room.INTRINSICS.width), np.nan, np.float32)
+        )
     assert poses(odometry).poses == [] and not odometry.events
     assert [segment.started for segment in odometry.segments] == [False]
 
@@ -132,7 +145,9 @@ def test_where_no_corner_is_tracked_the_whole_image_gives_the_turn() -> None:
     assert [event.event for event in odometry.events] == ["map begun"]
     T = chained(poses(odometry).poses)
     assert sorted(T) == list(range(len(truth)))
-    turned = rotation_angle(np.stack([T[k][:3, :3].T @ truth[k, :3, :3] for k in range(len(truth))]))
+    turned = rotation_angle(
+        np.stack([T[k][:3, :3].T @ truth[k, :3, :3] for k in range(len(truth))])
+    )
     assert np.rad2deg(turned).max() < 3.1
 
 
@@ -153,7 +168,9 @@ def test_the_reverse_of_a_motion_is_left(sign: float) -> None:
     start[:3, 3] = -sign * T_WORLD_NOW[:3, 3]
     T, found = first_motion(start, before, now, np.full(150, 3.0), CAMERA)
     step = invert(T)[:3, 3]
-    assert step @ T_WORLD_NOW[:3, 3] > 0.98 * np.linalg.norm(step) * np.linalg.norm(T_WORLD_NOW[:3, 3])
+    assert step @ T_WORLD_NOW[:3, 3] > 0.98 * np.linalg.norm(step) * np.linalg.norm(
+        T_WORLD_NOW[:3, 3]
+    )
     relief = np.median(found[depth > 3.0]) / np.median(found[depth < 3.0])
     assert relief == pytest.approx(2.0, rel=0.1)
     assert 1.5 < np.median(found) < 6.0

@@ -30,11 +30,15 @@ from slam.geometry.se3 import from_rotation_vector
 
 NO_NOISE = np.zeros(6)
 ROTATION_SIGMAS, DIRECTION_SIGMAS = np.full(3, 2e-4), np.array([0.004, 0.004, 0.0])
-T_PREVIOUS_CURRENT = se3.from_rotation_vector(np.deg2rad([0.0, 1.0, 0.0]), np.array([0.1, 0.0, 2.0]))
+T_PREVIOUS_CURRENT = se3.from_rotation_vector(
+    np.deg2rad([0.0, 1.0, 0.0]), np.array([0.1, 0.0, 2.0])
+)
 
 
 def triangulated_motion() -> Motion:
-    sigmas = pose_sigmas(T_PREVIOUS_CURRENT, np.concatenate([ROTATION_SIGMAS, DIRECTION_SIGMAS]), 0.05)
+    sigmas = pose_sigmas(
+        T_PREVIOUS_CURRENT, np.concatenate([ROTATION_SIGMAS, DIRECTION_SIGMAS]), 0.05
+    )
     pose = RelativePose(4, 5, T_PREVIOUS_CURRENT, sigmas, "essential")
     return Motion(pose, np.diag(np.concatenate([ROTATION_SIGMAS, DIRECTION_SIGMAS]) ** 2))
 
@@ -43,7 +47,9 @@ def test_another_length_keeps_rotation_and_direction() -> None:
     motion = triangulated_motion()
     scaled = motion.with_length(1.0, 0.03, 0.09, NO_NOISE)
     np.testing.assert_array_equal(scaled.T_from_to[:3, :3], T_PREVIOUS_CURRENT[:3, :3])
-    np.testing.assert_allclose(scaled.T_from_to[:3, 3], T_PREVIOUS_CURRENT[:3, 3] / np.hypot(0.1, 2.0), atol=1e-12)
+    np.testing.assert_allclose(
+        scaled.T_from_to[:3, 3], T_PREVIOUS_CURRENT[:3, 3] / np.hypot(0.1, 2.0), atol=1e-12
+    )
     np.testing.assert_array_equal(scaled.sigmas[:3], motion.relative_pose.sigmas[:3])
     assert 0.0299 <= scaled.sigmas[5] < 0.035
     assert scaled.correlated_sigmas is not None
@@ -83,7 +89,9 @@ def test_no_sigma_of_a_translation_is_zero() -> None:
         (4, 7, None),  # nothing leads on
     ],
 )
-def test_a_path_is_made_of_steps_that_follow_each_other(first: int, last: int, path: list[Ends] | None) -> None:
+def test_a_path_is_made_of_steps_that_follow_each_other(
+    first: int, last: int, path: list[Ends] | None
+) -> None:
     by_start = shortest_by_start([(0, 1), (1, 4), (4, 6), (0, 4)])
     assert path_between(by_start, first, last) == path
 
@@ -99,7 +107,9 @@ def test_a_path_is_made_of_steps_that_follow_each_other(first: int, last: int, p
         ([], 1, []),
     ],
 )
-def test_links_lead_from_the_first_frame_to_the_last(steps: list[Ends], frames: int, found: list[Ends]) -> None:
+def test_links_lead_from_the_first_frame_to_the_last(
+    steps: list[Ends], frames: int, found: list[Ends]
+) -> None:
     assert links(steps, frames) == found
 
 
@@ -166,7 +176,9 @@ def noise_of(turns_rad: np.ndarray, sigma_rad: float = 0.0, first: int = 0) -> n
 
 def turns(jitter_rad: np.ndarray, count: int = 400) -> np.ndarray:
     """A slalom, which is smooth, with white noise of three sigmas."""
-    smooth = np.stack([np.zeros(count), 0.03 * np.sin(np.arange(count) / 30.0), np.zeros(count)], axis=1)
+    smooth = np.stack(
+        [np.zeros(count), 0.03 * np.sin(np.arange(count) / 30.0), np.zeros(count)], axis=1
+    )
     return smooth + np.random.default_rng(0).normal(size=(count, 3)) * jitter_rad
 
 
@@ -178,7 +190,9 @@ def test_jitter_is_the_residual_to_a_smooth_motion():
 
 def test_gaps_are_left_out_and_few_steps_have_no_jitter():
     drive, number = turns(np.full(3, 1e-3)), np.arange(400)[:, None]
-    np.testing.assert_allclose(rotation_jitter(np.where(number % 40 != 7, drive, np.nan)), 1e-3, rtol=0.3)
+    np.testing.assert_allclose(
+        rotation_jitter(np.where(number % 40 != 7, drive, np.nan)), 1e-3, rtol=0.3
+    )
     np.testing.assert_array_equal(rotation_jitter(np.where(number % 4, drive, np.nan)), 0.0)
     np.testing.assert_array_equal(rotation_jitter(drive[:2]), 0.0)
 

@@ -25,12 +25,16 @@ RAYS = CAMERA.rays(CAMERA.pixel_grid())
 @pytest.fixture(scope="module")
 def texture() -> np.ndarray:
     rng = np.random.default_rng(0)
-    layers = [gaussian_filter(rng.normal(size=(1024, 1024)), sigma, mode="wrap") for sigma in (3, 8)]
+    layers = [
+        gaussian_filter(rng.normal(size=(1024, 1024)), sigma, mode="wrap") for sigma in (3, 8)
+    ]
     noise = sum(layer / layer.std() for layer in layers)
     return np.clip(128 + 45 * noise, 0, 255).astype(np.float32)
 
 
-def render(T_world_camera: np.ndarray, texture: np.ndarray, index: int = 0) -> tuple[Frame, np.ndarray]:
+def render(
+    T_world_camera: np.ndarray, texture: np.ndarray, index: int = 0
+) -> tuple[Frame, np.ndarray]:
     """A road, two walls and an end wall, all textured; image and true z-depth."""
     rays = RAYS @ T_world_camera[:3, :3].T
     centre = T_world_camera[:3, 3]
@@ -42,7 +46,11 @@ def render(T_world_camera: np.ndarray, texture: np.ndarray, index: int = 0) -> t
     points = centre + rays * depth[..., None]
     grey = np.zeros(depth.shape, np.float32)
     for k, (axis, _) in enumerate(planes):
-        a, b = (np.float32(25.0) * points[..., other].astype(np.float32) for other in range(3) if other != axis)
+        a, b = (
+            np.float32(25.0) * points[..., other].astype(np.float32)
+            for other in range(3)
+            if other != axis
+        )
         sampled = cv2.remap(texture, (a + 100 * k) % 1023, b % 1023, cv2.INTER_LINEAR)
         grey = np.where(nearest == k, sampled, grey)
     image = np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
@@ -92,7 +100,9 @@ def test_motion_is_recovered(texture, turn_deg, step):
 
 
 def test_sigmas_are_tight_in_rotation_and_direction_and_loose_in_length(texture):
-    measured = pose_of(measure(se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0])), texture))
+    measured = pose_of(
+        measure(se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0])), texture)
+    )
     rotation_deg, (x, y, z) = np.rad2deg(measured.sigmas[:3]), measured.sigmas[3:] / UNIT
     assert (rotation_deg >= 0.002).all()
     assert (rotation_deg < 0.1).all()
@@ -136,7 +146,9 @@ def behind_block(frame: Frame, left: int, ratio: tuple[float, float] = (0.6, 0.8
     """The frame behind something that is all texture, from column ``left`` on."""
     image = frame.image.copy()
     height, width = round(ratio[1] * len(image)), round(ratio[0] * image.shape[1])
-    grains = np.random.default_rng(3).integers(30, 220, (height // 6, width // 6, 3)).astype(np.uint8)
+    grains = (
+        np.random.default_rng(3).integers(30, 220, (height // 6, width // 6, 3)).astype(np.uint8)
+    )
     block = cv2.resize(grains, (width, height), interpolation=cv2.INTER_CUBIC)
     begin, end = max(left, 0), min(left + width, image.shape[1])
     if begin < end:
@@ -164,7 +176,9 @@ def test_what_passes_before_the_camera_is_not_the_world(texture, forward):
 
 def test_failures_carry_a_reason(texture):
     black = Frame(0, 0.0, np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8))
-    failure = VisualOdometry(CAMERA).measure(black, black, np.ones(black.image.shape[:2], np.float32))
+    failure = VisualOdometry(CAMERA).measure(
+        black, black, np.ones(black.image.shape[:2], np.float32)
+    )
     assert isinstance(failure, Failed)
     assert "only 0 corners could be tracked" in failure.reason
     rotation = se3.from_rotation_vector(np.deg2rad([0.0, 2.0, 0.0]), np.zeros(3))
@@ -175,7 +189,9 @@ def test_failures_carry_a_reason(texture):
 
 def drive(texture, turn_deg=(0.0, 0.0, 0.0), steps=(1.0, 1.0, 1.0, 1.0)):
     """Frames with their true depth, and the poses."""
-    increments = [se3.from_rotation_vector(np.deg2rad(turn_deg), np.array([0.0, 0.0, step])) for step in steps]
+    increments = [
+        se3.from_rotation_vector(np.deg2rad(turn_deg), np.array([0.0, 0.0, step])) for step in steps
+    ]
     poses = se3.chain(np.array(increments))
     return [render(T, texture, k) for k, T in enumerate(poses)], poses
 
@@ -188,7 +204,9 @@ def test_frames_two_apart_are_measured_beside_neighbours(texture):
         for k in range(5):
             for step in (1, 2):
                 if k >= step:
-                    measured = pose_of(odometry.measure(frames[k - step][0], frames[k][0], frames[k - step][1]))
+                    measured = pose_of(
+                        odometry.measure(frames[k - step][0], frames[k][0], frames[k - step][1])
+                    )
                     assert measured.T_from_to[2, 3] == pytest.approx(step, rel=0.02)
                     answers.append(measured.T_from_to)
     np.testing.assert_array_equal(answers[: len(answers) // 2], answers[len(answers) // 2 :])
@@ -197,7 +215,10 @@ def test_frames_two_apart_are_measured_beside_neighbours(texture):
 def test_a_rotation_across_two_steps_is_measured_in_its_two_images(texture):
     frames, poses = drive(texture, (0.1, 1.5, 0.0))
     odometry = VisualOdometry(CAMERA)
-    steps = [pose_of(odometry.measure(a[0], b[0], a[1])).T_from_to for a, b in itertools.pairwise(frames[:3])]
+    steps = [
+        pose_of(odometry.measure(a[0], b[0], a[1])).T_from_to
+        for a, b in itertools.pairwise(frames[:3])
+    ]
     first, last = frames[0], frames[2]
     across = odometry.relative_rotation(first[0], last[0], first[1], steps[0] @ steps[1])()
     assert across is not None
@@ -205,7 +226,9 @@ def test_a_rotation_across_two_steps_is_measured_in_its_two_images(texture):
     R_last_first = poses[2][:3, :3].T @ poses[0][:3, :3]
     assert np.rad2deg(se3.rotation_angle(across.R_to_from.T @ R_last_first)) < 0.02
     assert (np.rad2deg(across.sigmas) < 0.05).all()
-    assert odometry.relative_rotation(first[0], last[0], first[1], np.eye(4))() is None  # a camera that stood
+    assert (
+        odometry.relative_rotation(first[0], last[0], first[1], np.eye(4))() is None
+    )  # a camera that stood
 
 
 def test_track_ids_link_the_lengths_of_neighbouring_steps(texture):
@@ -256,14 +279,22 @@ def predictions(texture, steps, failing=()) -> dict[tuple[int, int], bool]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(CornerTracker, "track", watched)
         for first, second in steps:
-            height = 1e-3 if (first, second) in failing else 1.65  # no depth is trusted so far above the road
-            measured = odometry.measure(frames[first][0], frames[second][0], frames[first][1], height)
+            height = (
+                1e-3 if (first, second) in failing else 1.65
+            )  # no depth is trusted so far above the road
+            measured = odometry.measure(
+                frames[first][0], frames[second][0], frames[first][1], height
+            )
             assert isinstance(measured, Failed) == ((first, second) in failing)
     return predicted
 
 
 def test_the_last_motion_predicts_the_flow_of_the_next_step(texture):
-    assert predictions(texture, [(0, 1), (1, 2), (2, 3)]) == {(0, 1): False, (1, 2): True, (2, 3): True}
+    assert predictions(texture, [(0, 1), (1, 2), (2, 3)]) == {
+        (0, 1): False,
+        (1, 2): True,
+        (2, 3): True,
+    }
 
 
 def test_a_predicted_flow_does_not_outlive_a_gap(texture):
@@ -281,9 +312,12 @@ def test_a_step_that_failed_predicts_no_flow(texture):
 
 
 @pytest.mark.parametrize(
-    ("turn_deg", "forward", "source"), [((0.0, 1.0, 0.0), 1.0, "essential"), ((0.1, 2.0, 0.1), 0.01, "pnp")]
+    ("turn_deg", "forward", "source"),
+    [((0.0, 1.0, 0.0), 1.0, "essential"), ((0.1, 2.0, 0.1), 0.01, "pnp")],
 )
-def test_two_seeds_give_other_ransac_draws_and_one_seed_the_same(texture, turn_deg, forward, source):
+def test_two_seeds_give_other_ransac_draws_and_one_seed_the_same(
+    texture, turn_deg, forward, source
+):
     truth = se3.from_rotation_vector(np.deg2rad(turn_deg), np.array([0.0, 0.0, forward]))
     poses = [pose_of(measure(truth, texture, seed=seed)) for seed in (0, 1, 1, 2)]
     assert {pose.source for pose in poses} == {source}
@@ -301,14 +335,20 @@ def test_two_seeds_give_other_ransac_draws_and_one_seed_the_same(texture, turn_d
 )
 def test_rotation_on_real_frames(data_root, name, first, last, block, largest_deg):
     folder = data_root / "kitti_odometry" / "sequences" / name
-    P0 = np.array((folder / "calib.txt").read_text().splitlines()[0].split()[1:], float).reshape(3, 4)
+    P0 = np.array((folder / "calib.txt").read_text().splitlines()[0].split()[1:], float).reshape(
+        3, 4
+    )
     rows = np.loadtxt(data_root / "kitti_odometry" / "poses" / f"{name}.txt").reshape(-1, 3, 4)
     T_world_camera = se3.make(rows[:, :, :3], rows[:, :, 3])
     frames = []
     for k in range(first, last):
         grey = cv2.imread(str(folder / "image_0" / f"{k:06d}.jpg"), cv2.IMREAD_GRAYSCALE)
         frame = Frame(k, 0.1 * k, np.repeat(grey[..., None], 3, axis=2))
-        frames.append(behind_block(frame, 24 * (k + 1 - first) - round(0.6 * grey.shape[1])) if block else frame)
+        frames.append(
+            behind_block(frame, 24 * (k + 1 - first) - round(0.6 * grey.shape[1]))
+            if block
+            else frame
+        )
     height, width = frames[0].image.shape[:2]
     intrinsics = Intrinsics(width, height, P0[0, 0], P0[1, 1], P0[0, 2], P0[1, 2])
     odometry = VisualOdometry(intrinsics)
@@ -316,14 +356,18 @@ def test_rotation_on_real_frames(data_root, name, first, last, block, largest_de
     rotations_deg = []
     for previous, current in itertools.pairwise(frames):
         measured = pose_of(odometry.measure(previous, current, constant))
-        T_previous_current = se3.invert(T_world_camera[previous.index]) @ T_world_camera[current.index]
+        T_previous_current = (
+            se3.invert(T_world_camera[previous.index]) @ T_world_camera[current.index]
+        )
         error = T_previous_current[:3, :3].T @ measured.T_from_to[:3, :3]
         rotations_deg.append(np.rad2deg(se3.rotation_angle(error)))
     assert np.median(rotations_deg) < 0.1
     assert np.max(rotations_deg) < largest_deg
 
 
-def triangulated(track_ids: np.ndarray, previous: np.ndarray, current: np.ndarray) -> TriangulatedPoints:
+def triangulated(
+    track_ids: np.ndarray, previous: np.ndarray, current: np.ndarray
+) -> TriangulatedPoints:
     return TriangulatedPoints(track_ids, previous, current, np.full(len(track_ids), 0.02))
 
 
@@ -335,7 +379,9 @@ def test_ratio_of_lengths_from_common_points() -> None:
     wrong = np.where(track_ids < 10, 3.0, 1.0)
     later = triangulated(track_ids[::-1] + 5, depth[::-1] / 1.5, depth[::-1])
     assert triangulated(track_ids + 100, depth, depth).length_ratio(earlier) is None
-    shifted = triangulated(track_ids, wrong * depth / 1.5, depth)  # a step of 1.5 m, ten points on a car
+    shifted = triangulated(
+        track_ids, wrong * depth / 1.5, depth
+    )  # a step of 1.5 m, ten points on a car
     ratio = shifted.length_ratio(earlier)
     assert ratio is not None
     assert ratio[0] == pytest.approx(np.log(1.5 / 2.0), abs=1e-9)

@@ -51,7 +51,9 @@ def test_the_bias_over_distance_is_found_and_taken_out() -> None:
 
 
 def test_the_curve_has_the_distances_that_were_seen() -> None:
-    np.testing.assert_allclose(DepthError().corrected(np.array([1.0, 200.0, np.nan])), [1.0, 200.0, np.nan])
+    np.testing.assert_allclose(
+        DepthError().corrected(np.array([1.0, 200.0, np.nan])), [1.0, 200.0, np.nan]
+    )
     assert DepthError().curve() == []
     error, _ = after_steps(80, far=400, near=200)
     depths, biases, sigmas, corners = zip(*error.curve(), strict=True)
@@ -79,11 +81,17 @@ def test_moving_objects_in_a_tenth_of_the_corners_leave_the_bias_as_it_is() -> N
 @pytest.mark.parametrize("noise_px", [0.1, 0.3])
 def test_short_steps_do_not_bias_far_depth_nor_widen_its_sigma(noise_px: float) -> None:
     """Steps of half a metre past points of 4 to 200 m, whose learned depth scatters by 15 % around its own unit."""
-    rng, ahead, focal_px = np.random.default_rng(0), UnitRelativePose(np.eye(3), np.array([0.0, 0.0, -1.0])), 360.0
+    rng, ahead, focal_px = (
+        np.random.default_rng(0),
+        UnitRelativePose(np.eye(3), np.array([0.0, 0.0, -1.0])),
+        360.0,
+    )
     error, length = DepthError(), 0.5
     for _ in range(80):
         depth = np.exp(rng.uniform(np.log(4.0), np.log(200.0), 600))
-        before = np.column_stack([rng.uniform(-0.8, 0.8, 600), rng.uniform(-0.25, 0.25, 600), np.ones(600)])
+        before = np.column_stack(
+            [rng.uniform(-0.8, 0.8, 600), rng.uniform(-0.25, 0.25, 600), np.ones(600)]
+        )
         after = before * depth[:, None] + length * ahead.direction
         after /= after[:, 2:]
         after[:, :2] += rng.normal(0.0, noise_px / focal_px, (600, 2))
@@ -101,7 +109,9 @@ def shown(stated: float, turn_deg: float) -> FocalLength:
     rng, found = np.random.default_rng(0), FocalLength()
     for _ in range(20):
         T = se3.from_rotation_vector(np.deg2rad([0.2, turn_deg, 0.1]), np.array([0.1, -0.02, -0.9]))
-        world = np.column_stack([rng.uniform(-0.8, 0.8, 200), rng.uniform(-0.3, 0.2, 200), np.ones(200)])
+        world = np.column_stack(
+            [rng.uniform(-0.8, 0.8, 200), rng.uniform(-0.3, 0.2, 200), np.ones(200)]
+        )
         moved = se3.apply(T, world * rng.uniform(4.0, 40.0, 200)[:, None])
         previous, current = world, moved / moved[:, 2:]
         current[:, :2] += rng.normal(0, 0.1, (200, 2)) / FOCAL_PX

@@ -44,7 +44,9 @@ OF_CAR = np.arange(len(PIXELS)) >= len(SCENE)
 EXPECTED = np.concatenate([RNG.uniform(1, 15, len(SCENE)), np.full(len(MOVING_CAR), 8.0)])
 
 
-def estimated(matches: Matches, history: MotionHistory = NO_HISTORY, seed: int = 0) -> TwoViewEstimate:
+def estimated(
+    matches: Matches, history: MotionHistory = NO_HISTORY, seed: int = 0
+) -> TwoViewEstimate:
     """The motion of one step after some history."""
     found = estimate(matches, history, seed)
     assert found is not None
@@ -58,23 +60,31 @@ def matches_of(previous: np.ndarray, current: np.ndarray, learned: np.ndarray) -
     return Matches(previous, current, learned, sigma, road, np.ones(count), everyone, FOCAL_PX)
 
 
-def corner_with_a_car(seed: int, turn_deg: float = 4.0, error: float = 0.15) -> tuple[Matches, np.ndarray]:
+def corner_with_a_car(
+    seed: int, turn_deg: float = 4.0, error: float = 0.15
+) -> tuple[Matches, np.ndarray]:
     """``Matches`` of a camera that turns behind a car that turns with it, and the true ``T_current_previous``.
 
     The first ``CAR`` corners are the car's and stand still in the image; ``error`` is that of learned depth, relative.
     """
     rng = np.random.default_rng(seed)
-    T_current_previous = se3.from_rotation_vector(np.deg2rad([0.0, -turn_deg, 0.0]), np.array([0.05, 0.0, -0.7]))
+    T_current_previous = se3.from_rotation_vector(
+        np.deg2rad([0.0, -turn_deg, 0.0]), np.array([0.05, 0.0, -0.7])
+    )
     world = np.column_stack([rng.uniform(-0.8, 0.8, 60), rng.uniform(-0.25, 0.05, 60), np.ones(60)])
     depth = rng.uniform(12.0, 40.0, 60)
     moved = se3.apply(T_current_previous, world * depth[:, None])
-    car = np.column_stack([rng.uniform(-0.12, 0.12, CAR), rng.uniform(-0.1, 0.15, CAR), np.ones(CAR)])
+    car = np.column_stack(
+        [rng.uniform(-0.12, 0.12, CAR), rng.uniform(-0.1, 0.15, CAR), np.ones(CAR)]
+    )
     previous = np.concatenate([car, world])
     current = np.concatenate([car, moved / moved[:, 2:]])
     noise = rng.normal(0.0, 0.15 / FOCAL_PX, (2, len(previous), 2))
     previous[:, :2] += noise[0]
     current[:, :2] += noise[1]
-    learned = np.concatenate([np.full(CAR, 10.0), depth]) * np.exp(error * rng.normal(size=len(previous)))
+    learned = np.concatenate([np.full(CAR, 10.0), depth]) * np.exp(
+        error * rng.normal(size=len(previous))
+    )
     return matches_of(previous, current, learned), T_current_previous
 
 
@@ -87,11 +97,15 @@ def test_a_car_that_turns_with_the_camera_is_no_part_of_the_static_scene():
     by_essential, errors_deg, of_car, of_scene = [], [], [], []
     for seed in range(20):
         matches, T_current_previous = corner_with_a_car(seed)
-        unit_pose = unit_pose_by_essential(matches.rays_previous, matches.rays_current, INLIER_PX / FOCAL_PX)
+        unit_pose = unit_pose_by_essential(
+            matches.rays_previous, matches.rays_current, INLIER_PX / FOCAL_PX
+        )
         two_view = estimated(matches)
         assert unit_pose is not None
         by_essential.append(angle_deg(unit_pose.R_current_previous, T_current_previous[:3, :3]))
-        errors_deg.append(angle_deg(two_view.unit_pose.R_current_previous, T_current_previous[:3, :3]))
+        errors_deg.append(
+            angle_deg(two_view.unit_pose.R_current_previous, T_current_previous[:3, :3])
+        )
         of_car.append(two_view.inliers[:CAR].mean())
         of_scene.append(two_view.inliers[CAR:].mean())
     right = np.array(errors_deg) < 0.2
@@ -175,9 +189,14 @@ def test_a_car_that_turns_off_in_rain_does_not_turn_the_camera(first):
 def plain_road(seed: int, length: float = 0.9) -> tuple[Matches, np.ndarray, np.ndarray]:
     """Two thirds of the corners far, with learned depth 35 % too near; also which are near, and the true motion."""
     rng = np.random.default_rng(seed)
-    T_current_previous = se3.from_rotation_vector(np.deg2rad(rng.normal(0.0, 0.3, 3)), np.array([0.0, 0.0, -length]))
+    T_current_previous = se3.from_rotation_vector(
+        np.deg2rad(rng.normal(0.0, 0.3, 3)), np.array([0.0, 0.0, -length])
+    )
     near = np.arange(600) < 200
-    x, y = rng.uniform(-0.8, 0.8, 600), np.where(near, rng.uniform(0.1, 0.25, 600), rng.uniform(-0.12, 0.02, 600))
+    x, y = (
+        rng.uniform(-0.8, 0.8, 600),
+        np.where(near, rng.uniform(0.1, 0.25, 600), rng.uniform(-0.12, 0.02, 600)),
+    )
     depth = np.where(near, 1.65 / np.maximum(y, 0.1), rng.uniform(40.0, 90.0, 600))
     previous = np.column_stack([x, y, np.ones(600)])
     current = se3.apply(T_current_previous, previous * depth[:, None])
@@ -196,7 +215,9 @@ def test_learned_depth_that_sees_far_things_too_near_casts_out_no_near_corner():
         errors_deg.append(angle_deg(found.unit_pose.R_current_previous, T_current_previous[:3, :3]))
         kept.append(found.inliers[near].mean())
     assert max(errors_deg) < 0.1
-    assert min(kept) > 0.95  # as many as have less than four sigmas of noise across their epipolar lines
+    assert (
+        min(kept) > 0.95
+    )  # as many as have less than four sigmas of noise across their epipolar lines
 
 
 @pytest.fixture
@@ -226,7 +247,9 @@ def test_across_is_the_sampson_distance_of_the_essential_matrix(unit_pose: UnitR
     for x, y in zip(previous, current, strict=True):
         gradient = np.concatenate([(E @ x)[:2], (E.T @ y)[:2]])
         expected.append(FOCAL_PX * (y @ E @ x) / np.linalg.norm(gradient))
-    across, _ = Residuals(previous, current, depth, FOCAL_PX).across(unit_pose, tangent_of(unit_pose.direction))
+    across, _ = Residuals(previous, current, depth, FOCAL_PX).across(
+        unit_pose, tangent_of(unit_pose.direction)
+    )
     np.testing.assert_allclose(np.abs(across), np.abs(expected), rtol=1e-9)
     assert len(set(np.sign(across) * np.sign(expected))) == 1
 
@@ -234,7 +257,10 @@ def test_across_is_the_sampson_distance_of_the_essential_matrix(unit_pose: UnitR
 def test_along_is_the_distance_to_the_point_predicted_by_depth(unit_pose: UnitRelativePose):
     """Corners moved along their lines by what is then found; across them nothing counts."""
     previous, _, depth = rays()
-    points = se3.apply(se3.make(unit_pose.R_current_previous, LENGTH * unit_pose.direction), previous * depth[:, None])
+    points = se3.apply(
+        se3.make(unit_pose.R_current_previous, LENGTH * unit_pose.direction),
+        previous * depth[:, None],
+    )
     seen = points / points[:, 2:]
     turned = previous @ unit_pose.R_current_previous.T
     line = (seen - turned / turned[:, 2:])[:, :2]
@@ -243,7 +269,9 @@ def test_along_is_the_distance_to_the_point_predicted_by_depth(unit_pose: UnitRe
     current = seen.copy()
     current[:, :2] += aside[:, None] * line + 0.01 * line[:, ::-1] * [1.0, -1.0]
     tangent = tangent_of(unit_pose.direction)
-    along, _, shift_px = Residuals(previous, current, depth, FOCAL_PX).along(unit_pose, LENGTH, tangent)
+    along, _, shift_px = Residuals(previous, current, depth, FOCAL_PX).along(
+        unit_pose, LENGTH, tangent
+    )
     np.testing.assert_allclose(along[1:], -FOCAL_PX * aside[1:], atol=1e-9)
     expected = FOCAL_PX * np.linalg.norm((seen - turned / turned[:, 2:])[:, :2], axis=1)
     np.testing.assert_allclose(shift_px[1:], expected[1:], rtol=1e-9)
@@ -255,27 +283,47 @@ def test_derivatives_across_are_those_of_finite_differences(unit_pose: UnitRelat
     _, slopes = residuals.across(unit_pose, tangent)
     for k in range(5):
         step = 1e-6 * np.eye(5)[k]
-        ahead, behind = (residuals.across(moved(unit_pose, sign * step, tangent), tangent)[0] for sign in (1, -1))
+        ahead, behind = (
+            residuals.across(moved(unit_pose, sign * step, tangent), tangent)[0] for sign in (1, -1)
+        )
         np.testing.assert_allclose((ahead - behind) / 2e-6, slopes[k], atol=1e-8 * FOCAL_PX)
 
 
 def test_derivatives_along_are_those_of_finite_differences(unit_pose: UnitRelativePose):
     """Corners on their lines, where the rotation of the line has no effect; a corner of unknown depth is left out."""
     previous, _, depth = rays()
-    points = se3.apply(se3.make(unit_pose.R_current_previous, LENGTH * unit_pose.direction), previous * depth[:, None])
-    residuals, tangent = Residuals(previous, points / points[:, 2:], depth, FOCAL_PX), tangent_of(unit_pose.direction)
+    points = se3.apply(
+        se3.make(unit_pose.R_current_previous, LENGTH * unit_pose.direction),
+        previous * depth[:, None],
+    )
+    residuals, tangent = (
+        Residuals(previous, points / points[:, 2:], depth, FOCAL_PX),
+        tangent_of(unit_pose.direction),
+    )
     _, slopes, _ = residuals.along(unit_pose, LENGTH, tangent)
     for k in range(6):
         step = 1e-6 * np.eye(6)[k]
         ahead, behind = (
-            residuals.along(moved(unit_pose, sign * step, tangent), LENGTH + sign * step[5], tangent)[0]
+            residuals.along(
+                moved(unit_pose, sign * step, tangent), LENGTH + sign * step[5], tangent
+            )[0]
             for sign in (1, -1)
         )
-        np.testing.assert_allclose(((ahead - behind) / 2e-6)[1:], slopes[k][1:], atol=1e-7 * FOCAL_PX)
+        np.testing.assert_allclose(
+            ((ahead - behind) / 2e-6)[1:], slopes[k][1:], atol=1e-7 * FOCAL_PX
+        )
 
 
 @pytest.mark.parametrize(
-    "direction", [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.6, 0, -0.8], [0.6, -0.8, 0]]
+    "direction",
+    [
+        [0.0, 0.0, -1.0],
+        [0.0, 0.0, 1.0],
+        [1.0, 0.0, 0.0],
+        [0.0, -1.0, 0.0],
+        [0.6, 0, -0.8],
+        [0.6, -0.8, 0],
+    ],
 )
 def test_a_tangent_and_its_direction_are_orthonormal(direction: list[float]):
     axes = np.column_stack([tangent_of(np.array(direction)), direction])
@@ -344,5 +392,10 @@ def test_corners_beyond_the_edge_belong_to_the_nearest_cell() -> None:
     empty = DynamicMask.empty(416, 128)
     dynamic_mask = empty.updated(np.array([[416.0, 128.0], [-0.4, -0.4]]), np.array([True, False]))
     assert np.isfinite(dynamic_mask.weights(np.array([[416.0, 128.0], [-0.4, 0.0]]))).all()
-    assert dynamic_mask.corners[-1, -1] == dynamic_mask.inliers[-1, -1] == dynamic_mask.corners[0, 0] == 1.0
+    assert (
+        dynamic_mask.corners[-1, -1]
+        == dynamic_mask.inliers[-1, -1]
+        == dynamic_mask.corners[0, 0]
+        == 1.0
+    )
     assert dynamic_mask.inliers[0, 0] == 0.0

@@ -15,14 +15,42 @@ from slam.results.report.figures import MapView
 from slam.results.report.page import write_report
 
 MakeRun = Callable[..., RunFolder]
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome") or ""
-FLAGS = (
-    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--hide-scrollbars"),
-    *("--disable-background-networking", "--disable-component-update", "--disable-sync", "--disable-default-apps"),
-    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--enable-logging=stderr"),
-    *("--window-size=640,480", "--virtual-time-budget=12000", "--host-resolver-rules=MAP * ~NOTFOUND"),
+CHROMIUM = (
+    shutil.which("chromium")
+    or shutil.which("chromium-browser")
+    or shutil.which("google-chrome")
+    or ""
 )
-SLOW = re.compile("GPU stall due to ReadPixels|willReadFrequently")  # of the screenshot, and of words in a scene
+FLAGS = (
+    *(
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-quic",
+        "--no-first-run",
+        "--hide-scrollbars",
+    ),
+    *(
+        "--disable-background-networking",
+        "--disable-component-update",
+        "--disable-sync",
+        "--disable-default-apps",
+    ),
+    *(
+        "--use-gl=angle",
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+        "--enable-logging=stderr",
+    ),
+    *(
+        "--window-size=640,480",
+        "--virtual-time-budget=12000",
+        "--host-resolver-rules=MAP * ~NOTFOUND",
+    ),
+)
+SLOW = re.compile(
+    "GPU stall due to ReadPixels|willReadFrequently"
+)  # of the screenshot, and of words in a scene
 browser = pytest.mark.skipif(not CHROMIUM, reason="no Chromium is installed")
 
 
@@ -38,7 +66,9 @@ def browse(page: Path, *options: str) -> tuple[str, list[str]]:
     profile = f"--user-data-dir={page.parent / 'profile'}"
     command = [CHROMIUM, *FLAGS, profile, *options, page.as_uri()]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-    lines = [line for line in ended.stderr.splitlines() if "CONSOLE" in line and not SLOW.search(line)]
+    lines = [
+        line for line in ended.stderr.splitlines() if "CONSOLE" in line and not SLOW.search(line)
+    ]
     return ended.stdout, lines
 
 

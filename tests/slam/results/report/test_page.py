@@ -62,7 +62,9 @@ def parsed(folder: RunFolder) -> tuple[str, Balance]:
 def plots(html: str) -> dict[str, Any]:
     """Every plot by its title, as Plotly gets it."""
     found = re.findall(
-        r'<figure class="plot"><h3>([^<]*)</h3>.*?<script type="application/json">(.*?)</script>', html, re.S
+        r'<figure class="plot"><h3>([^<]*)</h3>.*?<script type="application/json">(.*?)</script>',
+        html,
+        re.S,
     )
     return {title: json.loads(plot) for title, plot in found}
 
@@ -88,7 +90,11 @@ def test_a_full_report_is_balanced_and_needs_no_network(full: RunFolder) -> None
     html, balance = parsed(full)
     without_data = re.sub(r"[\w+/=]{200,}", "", html)
     assert not re.search(r'https?:|@import|url\(|src="(?!data:)|<link', without_data)
-    (policy,) = [attrs["content"] for _, attrs in balance.tags if attrs.get("http-equiv") == "Content-Security-Policy"]
+    (policy,) = [
+        attrs["content"]
+        for _, attrs in balance.tags
+        if attrs.get("http-equiv") == "Content-Security-Policy"
+    ]
     assert str(policy).startswith("default-src 'none'")
     addresses = [attrs["href"] for tag, attrs in balance.tags if tag == "a"]
     assert addresses
@@ -109,13 +115,24 @@ def test_its_plots_have_the_numbers_of_the_run(full: RunFolder) -> None:
     ]
     lines = {line["name"]: line for line in found["Position error along the path"]["data"]}
     assert list(lines) == ["Network, chained", "Odometry", "Optimised"]
-    assert values(lines["Optimised"]["y"], "f4").max() < values(lines["Network, chained"]["y"], "f4").max()
+    assert (
+        values(lines["Optimised"]["y"], "f4").max()
+        < values(lines["Network, chained"]["y"], "f4").max()
+    )
     assert values(lines["Optimised"]["customdata"], "i4").tolist() == list(range(300))
-    (scale, *_) = (line for line in found["Scale and rotation over time"]["data"] if line["name"] == "Optimised")
+    (scale, *_) = (
+        line
+        for line in found["Scale and rotation over time"]["data"]
+        if line["name"] == "Optimised"
+    )
     assert values(scale["y"], "f4") == pytest.approx(1.01, abs=0.002)
     surface, path = found["Map"]["data"]
     assert (surface["type"], path["type"]) == ("mesh3d", "scatter3d")
-    assert len(surface["vertexcolor"]) == len(values(surface["x"], "f4")) > surface_corners(surface).max()
+    assert (
+        len(surface["vertexcolor"])
+        == len(values(surface["x"], "f4"))
+        > surface_corners(surface).max()
+    )
     assert values(path["y"], "f4").tolist() == list(range(60))  # ahead
     assert values(surface["z"], "f4").min() == pytest.approx(-1.65, abs=0.01)  # the ground is below
     assert html.count('id="plotly"') == 1
@@ -124,7 +141,11 @@ def test_its_plots_have_the_numbers_of_the_run(full: RunFolder) -> None:
 def test_it_shows_the_inputs_of_the_run_escaped(full: RunFolder) -> None:
     html, balance = parsed(full)
     words = " ".join(balance.words)
-    for said in ("sim/loop <42>", "MIT: trained on our own", "erfsfm-slam run --sequence '<b>09</b>' & more"):
+    for said in (
+        "sim/loop <42>",
+        "MIT: trained on our own",
+        "erfsfm-slam run --sequence '<b>09</b>' & more",
+    ):
         assert said in words
     assert "mode camera-height: one unit of the networks is 1.65 metres" in words
     assert "<b>09" not in html
@@ -132,18 +153,31 @@ def test_it_shows_the_inputs_of_the_run_escaped(full: RunFolder) -> None:
     assert "LEAK" not in html
 
 
-def test_the_first_sentence_says_how_good_it_is_and_why(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
+def test_the_first_sentence_says_how_good_it_is_and_why(
+    make_run: MakeRun, make_metrics: MakeMetrics
+) -> None:
     def said(**changed: Any) -> str:
         folder = make_run(metrics=make_metrics() | changed)
         write_report(folder)
         return " ".join(" ".join(parsed(folder)[1].words).split())
 
     good = said()
-    assert "2.6 m off the truth (RMSE, 0.87 % of its 299 m)" in good and "1 of 3 measured loops agree" in good
-    assert "47, 88, 93 % of its measurements" in good and "Doubts: lengths are 11 % too short." in good
+    assert (
+        "2.6 m off the truth (RMSE, 0.87 % of its 299 m)" in good
+        and "1 of 3 measured loops agree" in good
+    )
+    assert (
+        "47, 88, 93 % of its measurements" in good and "Doubts: lengths are 11 % too short." in good
+    )
     contradicted = [{"source": "lidar", "sigmas": 3.2, "figure": "its steps turn otherwise"}]
-    doubtful = said(agreement=contradicted, loops={"candidates": 9, "verified": 0, "accepted": 0, "rejected": []})
-    assert "no loop closes it (9 candidates)" in doubtful and "lidar contradicts the images" in doubtful
+    doubtful = said(
+        agreement=contradicted,
+        loops={"candidates": 9, "verified": 0, "accepted": 0, "rejected": []},
+    )
+    assert (
+        "no loop closes it (9 candidates)" in doubtful
+        and "lidar contradicts the images" in doubtful
+    )
     unknown = said(**make_metrics(reference=False, mode="none"), confidence={"run": 0.97})
     assert "its error is unknown: 97 % of drives like it" in unknown
     unsaid = said(confidence={"run": None, "run_reason": "the camera is carried"})
@@ -151,11 +185,17 @@ def test_the_first_sentence_says_how_good_it_is_and_why(make_run: MakeRun, make_
 
 
 def test_a_map_of_scraps_is_no_success(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
-    scraps = make_metrics()["map"] | {"triangles": 19908, "frames_fused": 40, "filters": {"range": 0.7, "sky": 0.263}}
+    scraps = make_metrics()["map"] | {
+        "triangles": 19908,
+        "frames_fused": 40,
+        "filters": {"range": 0.7, "sky": 0.263},
+    }
     folder = make_run(metrics=make_metrics() | {"map": scraps})
     write_report(folder)
     words = " ".join(" ".join(parsed(folder)[1].words).split())
-    assert "its map is scraps: 3.7 % of the depth" in words and "by the filter range (70 %)" in words
+    assert (
+        "its map is scraps: 3.7 % of the depth" in words and "by the filter range (70 %)" in words
+    )
     assert "Map triangles" not in words and "SCRAPS" in words
 
 
@@ -166,10 +206,16 @@ def test_a_leak_is_stamped(make_run: MakeRun, make_metrics: MakeMetrics) -> None
     assert '<div class="stamp" role="alert"><b>LEAK</b>' in html
 
 
-def test_without_reference_and_map_the_report_has_the_reasons(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
+def test_without_reference_and_map_the_report_has_the_reasons(
+    make_run: MakeRun, make_metrics: MakeMetrics
+) -> None:
     metrics = make_metrics(reference=False, mode="none")
     metrics |= {"map": None, "map_reason": "fusion is switched off"}
-    metrics["loops"] = {"candidates": None, "candidates_reason": "this part is not built yet", "rejected": []}
+    metrics["loops"] = {
+        "candidates": None,
+        "candidates_reason": "this part is not built yet",
+        "rejected": [],
+    }
     folder = make_run(metrics=metrics, reference=False)
     write_report(folder)
     html, balance = parsed(folder)
@@ -179,7 +225,9 @@ def test_without_reference_and_map_the_report_has_the_reasons(make_run: MakeRun,
     assert "this part is not built yet" in words
     assert "camera heights" in words
     assert list(plots(html)) == ["Trajectories from above", "Speed and rotation over time"]
-    assert "Position error" not in words and "every alignment" not in words, "no numbers that are dashes alone"
+    assert "Position error" not in words and "every alignment" not in words, (
+        "no numbers that are dashes alone"
+    )
 
 
 def test_a_failed_run_has_its_reason(make_run: MakeRun) -> None:
@@ -215,7 +263,9 @@ def test_lines_join_the_corners_of_the_loop() -> None:
     first, second = (np.full((64, 208, 3), 128, np.uint8) for _ in range(2))
     camera = Intrinsics(416, 128, 200.0, 200.0, 208.0, 64.0)  # of images twice as large
     corners = np.array([[[104.0, 64.0], [312.0, 32.0]]], np.float32)
-    loop = Loop(RelativePose(4, 6, np.eye(4), np.full(6, 0.1), LOOP_SOURCE), 50, 0.9, pixels=corners)
+    loop = Loop(
+        RelativePose(4, 6, np.eye(4), np.full(6, 0.1), LOOP_SOURCE), 50, 0.9, pixels=corners
+    )
     (picture,) = loop_pictures([loop], {4: first, 6: second}.get, camera)
     assert picture.title == "Frames 4 and 6: 50 inliers"
     shown = pixels(picture).astype(int)
@@ -232,9 +282,13 @@ def test_near_is_bright_and_unknown_is_dark() -> None:
     refined = learned.copy()
     refined[:, :40], refined[:, 80:] = 2.0, 0.0
     for frame in range(0, 60, 2):
-        pictures.add(KeyframeDepth(frame, refined, np.ones_like(refined), image, np.eye(4), learned))
+        pictures.add(
+            KeyframeDepth(frame, refined, np.ones_like(refined), image, np.eye(4), learned)
+        )
     found = pictures.pictures()
-    assert [picture.title for picture in found] == [f"Frame {frame}" for frame in (10, 20, 30, 40, 50)]
+    assert [picture.title for picture in found] == [
+        f"Frame {frame}" for frame in (10, 20, 30, 40, 50)
+    ]
     strip = pixels(found[0]).astype(int)
     assert strip.shape == (160, 3 * 480, 3)
     near, far, unknown = (strip[80, 960 + column] for column in (80, 240, 400))

@@ -16,7 +16,12 @@ from slam.runtime.errors import SlamError
 @pytest.fixture
 def quick(kitti_root: Path, tiny_weights: Path, tmp_path: Path) -> dict[str, Any]:
     overrides = ["visual_odometry.enabled=false", "output.report=false"]
-    return {"dataset": kitti_root, "weights": tiny_weights, "overrides": overrides, "output": tmp_path / "run"}
+    return {
+        "dataset": kitti_root,
+        "weights": tiny_weights,
+        "overrides": overrides,
+        "output": tmp_path / "run",
+    }
 
 
 def test_without_rerun_the_run_does_not_begin(
@@ -30,7 +35,9 @@ def test_without_rerun_the_run_does_not_begin(
         return find(name, *rest)
 
     monkeypatch.setattr(importlib, "import_module", absent)
-    with pytest.raises(SlamError, match=r"^--rerun and --view need rerun .*'erfsfm-slam\[rerun\]'") as refused:
+    with pytest.raises(
+        SlamError, match=r"^--rerun and --view need rerun .*'erfsfm-slam\[rerun\]'"
+    ) as refused:
         run_slam(**quick, rerun=tmp_path / "run.rrd")
     assert "\n" not in str(refused.value) and list(tmp_path.iterdir()) == []
 
@@ -47,7 +54,9 @@ class Recorder:
 
     def part(self, kind: str) -> Any:
         def made(*arguments: Any, **options: Any) -> Any:
-            return type(kind, (), {"arguments": arguments, "options": options, "compress": lambda s, **_: s})()
+            return type(
+                kind, (), {"arguments": arguments, "options": options, "compress": lambda s, **_: s}
+            )()
 
         return made
 
@@ -57,7 +66,9 @@ class Recorder:
     def save(self, path: str) -> None:
         Path(path).write_bytes(b"RRF2")
 
-    def set_time(self, timeline: str, sequence: int | None = None, duration: float | None = None) -> None:
+    def set_time(
+        self, timeline: str, sequence: int | None = None, duration: float | None = None
+    ) -> None:
         self.frame = sequence if timeline == "frame" else self.frame
 
     def log(self, place: str, what: Any, static: bool = False) -> None:
@@ -72,7 +83,9 @@ class Recorder:
         pass
 
 
-def test_everything_is_logged(quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_everything_is_logged(
+    quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     recorder = Recorder()
     for module in ("slam.commands.run", "slam.results.report.rerun"):
         monkeypatch.setattr(f"{module}.import_extra", lambda extra: (recorder,))

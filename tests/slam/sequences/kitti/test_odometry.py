@@ -14,7 +14,9 @@ from slam.sequences.catalogue import open_sequence
 def test_layouts_and_formats(tmp_path: Path, odometry, layout: str, suffix: str) -> None:
     base = tmp_path / "dataset" if layout == "dataset" else tmp_path
     odometry(base, suffix=suffix)
-    given = {"sequences": base / "sequences", "one": base / "sequences" / "00"}.get(layout, tmp_path)
+    given = {"sequences": base / "sequences", "one": base / "sequences" / "00"}.get(
+        layout, tmp_path
+    )
     sequence = open_sequence(given, "00", None, None)
     assert (sequence.name, len(sequence)) == ("00", 6)
     assert sequence.frame(3).image[0, 0] == pytest.approx([30, 30, 30], abs=2)
@@ -25,7 +27,9 @@ def test_layouts_and_formats(tmp_path: Path, odometry, layout: str, suffix: str)
 
 
 @pytest.mark.parametrize("camera", [0, 1, 2, 3])
-def test_each_camera_has_its_intrinsics_and_reference(tmp_path: Path, odometry, camera: int) -> None:
+def test_each_camera_has_its_intrinsics_and_reference(
+    tmp_path: Path, odometry, camera: int
+) -> None:
     folder = odometry(tmp_path, camera=camera)
     rows = (folder / "calib.txt").read_text().splitlines()
     rows[camera] = rows[camera].replace("30 0 20", "31 0 20", 1).replace("30 12", "31 12")
@@ -67,7 +71,9 @@ def test_scans(tmp_path: Path, odometry) -> None:
         sequence.scan(0)
 
 
-def test_missing_times_fall_back(tmp_path: Path, odometry, caplog: pytest.LogCaptureFixture) -> None:
+def test_missing_times_fall_back(
+    tmp_path: Path, odometry, caplog: pytest.LogCaptureFixture
+) -> None:
     folder = odometry(tmp_path)
     (folder / "times.txt").unlink()
     with caplog.at_level(logging.WARNING):
@@ -107,7 +113,11 @@ def test_given_camera_replaces_calibration(tmp_path: Path, odometry, camera_yaml
         ),
         ("calib.txt", None, r"no calib\.txt in "),
         ("calib.txt", "P2: 1 2 3\n", "row P2 has 3 numbers"),
-        ("../../poses/00.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n" * 4, r"00\.txt has 4 poses for 6 images: .*cut the poses"),
+        (
+            "../../poses/00.txt",
+            "1 0 0 0 0 1 0 0 0 0 1 0\n" * 4,
+            r"00\.txt has 4 poses for 6 images: .*cut the poses",
+        ),
         ("../../poses/00.txt", "1 0 0\n" * 6, r"00\.txt"),
         ("times.txt", "0\n0.1\n", r"times\.txt has 2 rows for 6 images"),
         ("times.txt", "one\n" * 6, r"times\.txt, line 1"),
@@ -115,7 +125,9 @@ def test_given_camera_replaces_calibration(tmp_path: Path, odometry, camera_yaml
         ("image_2/*.png", None, "looked for png or jpg in .*image_2"),
     ],
 )
-def test_broken_sequences(tmp_path: Path, odometry, file: str, content: str | None, message: str) -> None:
+def test_broken_sequences(
+    tmp_path: Path, odometry, file: str, content: str | None, message: str
+) -> None:
     folder = odometry(tmp_path)
     for path in [*folder.glob(file)] or [folder / file]:
         path.unlink(missing_ok=True)
@@ -132,7 +144,9 @@ def test_a_bad_time_is_interpolated(tmp_path: Path, odometry, bad: str, row: int
     times = [str(k) for k in range(6)]
     times[row] = bad
     (odometry(tmp_path) / "times.txt").write_text("\n".join(times))
-    np.testing.assert_allclose(open_sequence(tmp_path, "00", None, None).stamps, np.arange(6), atol=1e-9)
+    np.testing.assert_allclose(
+        open_sequence(tmp_path, "00", None, None).stamps, np.arange(6), atol=1e-9
+    )
 
 
 def test_a_bad_pose_is_bridged(tmp_path: Path, odometry) -> None:
@@ -141,7 +155,9 @@ def test_a_bad_pose_is_bridged(tmp_path: Path, odometry) -> None:
     rows = path.read_text().splitlines()
     path.write_text("\n".join([rows[0], "nan " * 12, *rows[2:5], rows[5][:20]]))
     poses = open_sequence(tmp_path, "00", None, None).T_any_camera
-    np.testing.assert_allclose(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(
+        np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1), 1, atol=1e-6
+    )
 
 
 def test_later_damage_is_an_error_when_read(tmp_path: Path, odometry) -> None:
@@ -175,7 +191,11 @@ def kept(path: Path, numbers: list[int]) -> None:
 @pytest.mark.parametrize("times", [range(10), range(1, 10), [1, 2, 5, 6, 7, 9], None])
 @pytest.mark.parametrize("poses", [range(10), range(1, 10), [1, 2, 5, 6, 7, 9]])
 def test_missing_numbers_are_missing_frames(
-    tmp_path: Path, gap: Path, caplog: pytest.LogCaptureFixture, times: list[int] | None, poses: list[int]
+    tmp_path: Path,
+    gap: Path,
+    caplog: pytest.LogCaptureFixture,
+    times: list[int] | None,
+    poses: list[int],
 ) -> None:
     if times is None:
         (gap / "times.txt").unlink()
@@ -186,7 +206,9 @@ def test_missing_numbers_are_missing_frames(
     assert len(sequence) == len(sequence.stamps) == 9
     assert np.diff(sequence.stamps) == pytest.approx(0.1)
     assert sequence.reference is not None
-    assert sequence.reference[:, :3, 3] == pytest.approx(np.outer(np.arange(9), [0, 0, 1]), abs=1e-9)
+    assert sequence.reference[:, :3, 3] == pytest.approx(
+        np.outer(np.arange(9), [0, 0, 1]), abs=1e-9
+    )
     assert [sequence.frame(row).image[0, 0, 0] for row in (0, 1, 4, 8)] == [10, 20, 50, 90]
     assert sequence.provenance() == ("kitti_odometry/00[1:10]",)
     assert sequence.scan(4).tolist() == [[7, 8, 9]]

@@ -45,7 +45,9 @@ def write_drive(root: Path, late_s: float = 0.0, name: str = NAME) -> Path:
         row[:3] = lat0 + distance / metres, 8.0 + distance / metres / np.cos(np.deg2rad(lat0)), 100
         row[5:8] = np.pi / 4, speed, speed
         (drive / f"oxts/data/{k:010d}.txt").write_text(" ".join(f"{x:.14g}" for x in row))
-    (drive / "velodyne_points/data/0000000002.bin").write_bytes(np.array([7, 8, 9, 1], np.float32).tobytes())
+    (drive / "velodyne_points/data/0000000002.bin").write_bytes(
+        np.array([7, 8, 9, 1], np.float32).tobytes()
+    )
     (drive / "image_02/timestamps.txt").write_text(times(0.0))
     (drive / "oxts/timestamps.txt").write_text(times(late_s))
     return drive
@@ -128,7 +130,9 @@ def test_a_step_north_and_east_in_metres() -> None:
     packets = np.stack([packet(), packet(lat=49 + step), packet(lon=step)])
     t = T_world_imu(packets, np.zeros(3))[:, :3, 3]
     assert t[1] - t[0] == pytest.approx([0, 6378137 * np.deg2rad(step), 0], abs=1e-5)
-    assert t[2] - t[0] == pytest.approx([6378137 * np.deg2rad(step) * np.cos(np.deg2rad(49)), 0, 0], abs=1e-5)
+    assert t[2] - t[0] == pytest.approx(
+        [6378137 * np.deg2rad(step) * np.cos(np.deg2rad(49)), 0, 0], abs=1e-5
+    )
 
 
 def test_packets_are_extrapolated_to_their_image() -> None:

@@ -43,22 +43,39 @@ class BagWriter:
     def header(self, stamp_ns: int, frame: str) -> Any:
         seconds, nanoseconds = divmod(stamp_ns, 10**9)
         stamp = self.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
-        return self.make("std_msgs/msg/Header", **({"seq": 0} if self.is_ros1 else {}), stamp=stamp, frame_id=frame)
+        return self.make(
+            "std_msgs/msg/Header",
+            **({"seq": 0} if self.is_ros1 else {}),
+            stamp=stamp,
+            frame_id=frame,
+        )
 
-    def transform(self, position: tuple[float, float, float], quaternion_xyzw: tuple[float, ...] = (0, 0, 0, 1)) -> Any:
+    def transform(
+        self,
+        position: tuple[float, float, float],
+        quaternion_xyzw: tuple[float, ...] = (0, 0, 0, 1),
+    ) -> Any:
         t = self.make("geometry_msgs/msg/Vector3", **dict(zip("xyz", map(float, position))))
-        q = self.make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", map(float, quaternion_xyzw))))
+        q = self.make(
+            "geometry_msgs/msg/Quaternion", **dict(zip("xyzw", map(float, quaternion_xyzw)))
+        )
         return self.make("geometry_msgs/msg/Transform", translation=t, rotation=q)
 
     def stamped_transform(self, stamp_ns: int, parent: str, child: str, transform: Any) -> Any:
         kind = "geometry_msgs/msg/TransformStamped"
-        return self.make(kind, header=self.header(stamp_ns, parent), child_frame_id=child, transform=transform)
+        return self.make(
+            kind, header=self.header(stamp_ns, parent), child_frame_id=child, transform=transform
+        )
 
     def mount(self, parent: str, child: str, transform: Any) -> None:
         each = self.stamped_transform(FIRST_NS, parent, child, transform)
-        self.write("/tf_static", FIRST_NS - 1, self.make("tf2_msgs/msg/TFMessage", transforms=[each]))
+        self.write(
+            "/tf_static", FIRST_NS - 1, self.make("tf2_msgs/msg/TFMessage", transforms=[each])
+        )
 
-    def image(self, topic: str, stamp_ns: int, pixels: np.ndarray, encoding: str, late_ns: int = 0) -> None:
+    def image(
+        self, topic: str, stamp_ns: int, pixels: np.ndarray, encoding: str, late_ns: int = 0
+    ) -> None:
         """The image, recorded ``late_ns`` after its stamp; rows end with three bytes of padding."""
         rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(len(pixels), -1)
         padded = np.pad(rows, ((0, 0), (0, 3)))
@@ -85,7 +102,9 @@ class BagWriter:
     ) -> None:
         """``region`` is x offset, y offset, width and height of the images on the sensor."""
         K = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1], np.float64)
-        P = np.insert(K.reshape(3, 3) + np.diag([1, 1, 0]), 3, 0, axis=1).ravel()  # focal lengths 1 pixel longer
+        P = np.insert(
+            K.reshape(3, 3) + np.diag([1, 1, 0]), 3, 0, axis=1
+        ).ravel()  # focal lengths 1 pixel longer
         values = {"d": np.array(distortion, np.float64), "k": K, "r": np.eye(3).ravel(), "p": P}
         roi = dict(zip(("x_offset", "y_offset", "width", "height"), region)) | {"do_rectify": False}
         message = self.make(

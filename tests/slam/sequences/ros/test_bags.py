@@ -33,7 +33,13 @@ def drive(bag: Any, topic: str = "/cam0/image_raw", encoding: str = "mono8") -> 
     """Six images whose stamps go backwards in the bag: the first two are recorded in the other order."""
     bag.camera_info(f"{topic.rpartition('/')[0]}/camera_info", CAMERA, "plumb_bob", (0.0,) * 5)
     for k in range(FRAMES):
-        bag.image(topic, FIRST_NS + k * STEP_NS, picture(k), encoding, late_ns=2 * STEP_NS if k == 0 else 0)
+        bag.image(
+            topic,
+            FIRST_NS + k * STEP_NS,
+            picture(k),
+            encoding,
+            late_ns=2 * STEP_NS if k == 0 else 0,
+        )
 
 
 def test_opens(new_bag: NewBag, kind: str) -> None:
@@ -51,7 +57,9 @@ def test_opens(new_bag: NewBag, kind: str) -> None:
         (file,) = (file for file in path.iterdir() if file.suffix in (".db3", ".mcap"))
         assert open_sequence(file).stamps.tolist() == sequence.stamps.tolist()
     line = examine(path)[-1]
-    assert line.startswith("ok       sequence /cam0/image_raw: 6 frames of 40x24") and line.endswith("(ROS bag)")
+    assert line.startswith(
+        "ok       sequence /cam0/image_raw: 6 frames of 40x24"
+    ) and line.endswith("(ROS bag)")
     assert open_sequence(path.parent, frames="1:3").name == "walk"
 
 
@@ -60,13 +68,23 @@ def test_compressed_images(new_bag: NewBag, kind: str, suffix: str) -> None:
     bag = new_bag(kind)
     bag.camera_info("/camera/camera_info", CAMERA, "plumb_bob", (0.0,) * 5)
     data = cv2.imencode(suffix, picture(1, 3))[1].ravel()
-    message = bag.make("sensor_msgs/msg/CompressedImage", header=bag.header(FIRST_NS, "c"), format="x", data=data)
+    message = bag.make(
+        "sensor_msgs/msg/CompressedImage", header=bag.header(FIRST_NS, "c"), format="x", data=data
+    )
     bag.write("/camera/image_raw/compressed", FIRST_NS, message)
     expected = cv2.imdecode(data, cv2.IMREAD_COLOR)[:, :, ::-1]
     assert np.array_equal(open_sequence(bag.close()).frame(0).image, expected)
 
 
-CHANNELS = {"rgb8": 3, "bgra8": 4, "8UC3": 3, "yuv422": 2, "yuv422_yuy2": 2, "mono16": 1, "16UC1": 1}
+CHANNELS = {
+    "rgb8": 3,
+    "bgra8": 4,
+    "8UC3": 3,
+    "yuv422": 2,
+    "yuv422_yuy2": 2,
+    "mono16": 1,
+    "16UC1": 1,
+}
 
 
 @pytest.mark.parametrize(("encoding", "channels"), CHANNELS.items())
@@ -101,7 +119,9 @@ def test_calibration(new_bag: NewBag, kind: str) -> None:
     assert open_sequence(path, "/bent/image_raw").intrinsics.fx not in (30, 31)
     with pytest.raises(SequenceError, match=r"spiral is unknown: known are .*give --camera"):
         open_sequence(path, "/odd/image_raw")
-    with pytest.raises(SequenceError, match=r"no /bare/camera_info for /bare/image_raw .*give --camera"):
+    with pytest.raises(
+        SequenceError, match=r"no /bare/camera_info for /bare/image_raw .*give --camera"
+    ):
         open_sequence(path, "/bare/image_raw")
     assert open_sequence(path, "/bare/image_raw", Path("fov=90")).intrinsics.fx == pytest.approx(20)
 
@@ -111,12 +131,16 @@ def test_images_are_a_binned_region_of_the_calibrated_sensor(new_bag: NewBag, ki
     sensor = Intrinsics(87, 60, 60, 60, 44.5, 31.5)
     bag = new_bag(kind)
     bag.camera_info("/part/camera_info", sensor, "plumb_bob", (), 2, (4, 7, 81, 48))
-    bag.camera_info("/all/camera_info", replace(sensor, width=40, height=24, cx=20, cy=12), "plumb_bob", (), 2)
+    bag.camera_info(
+        "/all/camera_info", replace(sensor, width=40, height=24, cx=20, cy=12), "plumb_bob", (), 2
+    )
     for topic in ("/part/image_raw", "/all/image_raw"):
         bag.image(topic, FIRST_NS, picture(0), "mono8")
     path = bag.close()
     assert open_sequence(path, "/part/image_raw").intrinsics == CAMERA
-    assert open_sequence(path, "/all/image_raw").intrinsics.fx == 60  # the driver states a binning of whole images
+    assert (
+        open_sequence(path, "/all/image_raw").intrinsics.fx == 60
+    )  # the driver states a binning of whole images
 
 
 def test_rectified_images_stand_for_the_raw_ones_beside_them(new_bag: NewBag, kind: str) -> None:
@@ -134,7 +158,13 @@ def test_a_clock_that_was_set_back_gives_way_to_the_times_of_recording(
     bag.camera_info("/cam0/camera_info", CAMERA, "plumb_bob", (0.0,) * 5)
     for k in range(40):
         early_ns = 21 * STEP_NS if k >= 20 else 0
-        bag.image("/cam0/image_raw", FIRST_NS + k * STEP_NS - early_ns, picture(k), "mono8", late_ns=early_ns)
+        bag.image(
+            "/cam0/image_raw",
+            FIRST_NS + k * STEP_NS - early_ns,
+            picture(k),
+            "mono8",
+            late_ns=early_ns,
+        )
     sequence = open_sequence(bag.close())
     np.testing.assert_allclose(np.diff(sequence.stamps), STEP_NS / 1e9, atol=1e-6)
     np.testing.assert_array_equal(sequence.frame(21).image[:, :, 0], picture(21))
@@ -166,7 +196,8 @@ def test_true_poses_and_scans_come_with_their_static_transforms(new_bag: NewBag,
             bag.stamped_transform(FIRST_NS + k * STEP_NS, "w", "body", transform),
         )
     fields = [
-        bag.make("sensor_msgs/msg/PointField", name=n, offset=4 * i, datatype=7, count=1) for i, n in enumerate("xyz")
+        bag.make("sensor_msgs/msg/PointField", name=n, offset=4 * i, datatype=7, count=1)
+        for i, n in enumerate("xyz")
     ]
     lost = bag.stamped_transform(FIRST_NS + 1, "w", "body", bag.transform((9, 9, 9), (0, 0, 0, 0)))
     bag.write("/ground_truth", FIRST_NS + 1, lost)
@@ -187,24 +218,36 @@ def test_true_poses_and_scans_come_with_their_static_transforms(new_bag: NewBag,
         bag.write("/points", FIRST_NS + 3 * STEP_NS + late_ns, cloud)
     sequence = open_sequence(bag.close())
     assert sequence.reference is not None
-    assert sequence.reference[:, :3, 3] == pytest.approx(np.outer(np.arange(FRAMES), [0, 0, 1]), abs=1e-9)
+    assert sequence.reference[:, :3, 3] == pytest.approx(
+        np.outer(np.arange(FRAMES), [0, 0, 1]), abs=1e-9
+    )
     assert [k for k in range(FRAMES) if sequence.has_scan(k)] == [2]
     assert sequence.scan(2).tolist() == [[1, 2, 3], [4, 5, 6]]
-    assert sequence.T_camera_lidar is not None and sequence.T_camera_lidar[:3, 3].tolist() == [0, -2, 0]
+    assert sequence.T_camera_lidar is not None and sequence.T_camera_lidar[:3, 3].tolist() == [
+        0,
+        -2,
+        0,
+    ]
 
 
 def test_damaged_bags_are_named_in_one_line(new_bag: NewBag, kind: str) -> None:
     bag = new_bag(kind)
     drive(bag)
     path = bag.close()
-    file = path if path.is_file() else next(each for each in path.iterdir() if each.suffix in (".db3", ".mcap"))
+    file = (
+        path
+        if path.is_file()
+        else next(each for each in path.iterdir() if each.suffix in (".db3", ".mcap"))
+    )
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     with pytest.raises(SequenceError, match=r"bag .*walk.* cannot be read") as caught:
         open_sequence(path)
     assert "\n" not in str(caught.value)
 
 
-def test_an_mcap_of_another_program_is_named_and_converted_as_advised(tmp_path: Path, new_bag: NewBag) -> None:
+def test_an_mcap_of_another_program_is_named_and_converted_as_advised(
+    tmp_path: Path, new_bag: NewBag
+) -> None:
     def record(kind: int, content: bytes) -> bytes:
         return struct.pack("<BQ", kind, len(content)) + content
 
@@ -213,11 +256,17 @@ def test_an_mcap_of_another_program_is_named_and_converted_as_advised(tmp_path: 
 
     magic = b"\x89MCAP0\r\n"
     start = magic + record(1, text("") + text("test"))
-    schema = record(3, struct.pack("<H", 1) + text("foxglove.RawImage") + text("jsonschema") + text("{}"))
-    channel = record(4, struct.pack("<HH", 1, 1) + text("/cam") + text("json") + struct.pack("<I", 0))
+    schema = record(
+        3, struct.pack("<H", 1) + text("foxglove.RawImage") + text("jsonschema") + text("{}")
+    )
+    channel = record(
+        4, struct.pack("<HH", 1, 1) + text("/cam") + text("json") + struct.pack("<I", 0)
+    )
     footer = record(2, struct.pack("<QQI", len(start), 0, 0))
     (tmp_path / "walk.mcap").write_bytes(start + schema + channel + footer + magic)
-    with pytest.raises(SequenceError, match=r"holds /cam \(foxglove.RawImage, json\); convert it to a bag of ROS 2"):
+    with pytest.raises(
+        SequenceError, match=r"holds /cam \(foxglove.RawImage, json\); convert it to a bag of ROS 2"
+    ):
         open_sequence(tmp_path / "walk.mcap")
     converted = new_bag("mcap", "converted")
     drive(converted)
@@ -233,7 +282,9 @@ def test_true_poses_are_those_that_are_named_so(
     bag.mount("rig", "camera", bag.transform((0, 0, 1)))
     for k in range(-1, FRAMES + 1):
         stamp, where = FIRST_NS + k * STEP_NS, bag.transform((k, 5, 0))
-        each = bag.stamped_transform(stamp, "vicon/world", "rig" if how == "tf" else "camera", where)
+        each = bag.stamped_transform(
+            stamp, "vicon/world", "rig" if how == "tf" else "camera", where
+        )
         point = bag.make("geometry_msgs/msg/Point", x=float(k), y=5.0, z=0.0)
         pose = bag.make("geometry_msgs/msg/Pose", position=point, orientation=where.rotation)
         pose = bag.make("geometry_msgs/msg/PoseStamped", header=bag.header(stamp, "w"), pose=pose)
@@ -248,12 +299,16 @@ def test_true_poses_are_those_that_are_named_so(
     if how == "unnamed":
         assert reference is None and "/pose is not named as truth" in caplog.text
     else:
-        assert reference is not None and reference[:, 0, 3] == pytest.approx(np.arange(FRAMES), abs=1e-6)
+        assert reference is not None and reference[:, 0, 3] == pytest.approx(
+            np.arange(FRAMES), abs=1e-6
+        )
 
 
 def test_a_calibration_without_a_size_is_of_the_images(new_bag: NewBag, kind: str) -> None:
     bag = new_bag(kind)
-    bag.camera_info("/cam0/camera_info", SimpleNamespace(**(vars(CAMERA) | {"width": 0, "height": 0})), "", ())
+    bag.camera_info(
+        "/cam0/camera_info", SimpleNamespace(**(vars(CAMERA) | {"width": 0, "height": 0})), "", ()
+    )
     bag.image("/cam0/image_raw", FIRST_NS, picture(0), "mono8")
     assert open_sequence(bag.close()).intrinsics == CAMERA
 
@@ -265,7 +320,9 @@ def test_compressed_images_of_16_bits_share_a_stretch(new_bag: NewBag, kind: str
         values = (7000 + 4 * (k + 1) * picture(0).astype(np.uint16)).astype(np.uint16)
         data, stamp = cv2.imencode(".png", values)[1].ravel(), FIRST_NS + k * STEP_NS
         fields = {"header": bag.header(stamp, "c"), "format": "mono16; png", "data": data}
-        bag.write("/c/image/compressed", stamp, bag.make("sensor_msgs/msg/CompressedImage", **fields))
+        bag.write(
+            "/c/image/compressed", stamp, bag.make("sensor_msgs/msg/CompressedImage", **fields)
+        )
     sequence = open_sequence(bag.close())
     dark, bright = (float(sequence.frame(k).image.mean()) for k in range(2))
     assert bright == pytest.approx(2 * dark, rel=0.05)
@@ -276,12 +333,17 @@ def test_a_bag_without_images_says_what_it_holds(new_bag: NewBag, kind: str) -> 
     bag.camera_info("/cam0/camera_info", CAMERA, "plumb_bob", (0.0,) * 5)
     bag.image("/depth/image_raw", FIRST_NS, np.ones((24, 40), np.uint16), "16UC1")
     path = bag.close()
-    with pytest.raises(SequenceError, match=r"no topic with images of a camera: it holds .*/depth/image_raw \(sensor"):
+    with pytest.raises(
+        SequenceError,
+        match=r"no topic with images of a camera: it holds .*/depth/image_raw \(sensor",
+    ):
         open_sequence(path)
     assert examine(path)[-1].startswith("missing")
 
 
-def test_without_rosbags_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_rosbags_the_extra_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "walk.bag").write_bytes(b"")
 
     def absent(name: str) -> None:

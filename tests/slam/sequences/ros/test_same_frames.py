@@ -33,7 +33,9 @@ def write_euroc(folder: Path, files: list[Path], stamps: list[int], camera: Came
     data.mkdir(parents=True)
     for path, stamp in zip(files, stamps, strict=True):
         shutil.copy(path, data / f"{stamp}.png")
-    (data.parent / "data.csv").write_text("#timestamp,filename\n" + "".join(f"{s},{s}.png\n" for s in stamps))
+    (data.parent / "data.csv").write_text(
+        "#timestamp,filename\n" + "".join(f"{s},{s}.png\n" for s in stamps)
+    )
     sensor = {
         "T_BS": {"data": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]},
         "rate_hz": 10,
@@ -54,12 +56,16 @@ def write_bag(bag: Any, files: list[Path], stamps: list[int], camera: CameraFile
     return made
 
 
-def test_the_same_frames_are_the_same_sequence(tmp_path: Path, kitti_root: Path, new_bag: Callable[..., Any]) -> None:
+def test_the_same_frames_are_the_same_sequence(
+    tmp_path: Path, kitti_root: Path, new_bag: Callable[..., Any]
+) -> None:
     files = sorted((kitti_root / "sequences/sim/image_2").iterdir())[:FRAMES]
     stamps = [FIRST_NS + k * STEP_NS for k in range(FRAMES)]
     simulated = open_sequence(kitti_root).intrinsics
     known = read_camera_file(kitti_root / "camera.yaml").model_dump() | vars(Pinhole.of(simulated))
-    camera = CameraFile.model_validate(known | {"model": "opencv", "distortion": BENT, "camera_height_m": "unknown"})
+    camera = CameraFile.model_validate(
+        known | {"model": "opencv", "distortion": BENT, "camera_height_m": "unknown"}
+    )
     plain, *others = map(
         open_sequence,
         (
@@ -69,7 +75,9 @@ def test_the_same_frames_are_the_same_sequence(tmp_path: Path, kitti_root: Path,
             write_bag(new_bag("sqlite", "two"), files, stamps, camera),
         ),
     )
-    assert plain.intrinsics.undistorted and plain.stamps[0] == pytest.approx(FIRST_NS / 1e9, abs=1e-6)
+    assert plain.intrinsics.undistorted and plain.stamps[0] == pytest.approx(
+        FIRST_NS / 1e9, abs=1e-6
+    )
     for other in others:
         assert other.intrinsics == plain.intrinsics and other.camera_height_m is None
         np.testing.assert_array_equal(other.stamps, plain.stamps)

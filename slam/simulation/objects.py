@@ -5,54 +5,7 @@ from itertools import pairwise
 import numpy as np
 
 from slam.simulation.geometry import FloatArray, Material, Soup
-
-UP = np.array([0.0, 0.0, 1.0])
-
-
-def colour(
-    rng: np.random.Generator, *choices: tuple[float, float, float], spread: float = 0.06
-) -> FloatArray:
-    """One of the given colours, a little off, ``(3,)``."""
-    base = np.array(choices[rng.integers(len(choices))])
-    return np.asarray(
-        np.clip(base + rng.normal(0.0, spread) + rng.normal(0.0, 0.4 * spread, 3), 0.02, 1.0)
-    )
-
-
-def frame_at(x: float, y: float, angle: float, z: float = 0.0) -> FloatArray:
-    """Plan frame at a place, x axis turned by ``angle`` from east: rows x, y, z axis and origin, ``(4, 3)``."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0], [x, y, z]])
-
-
-def box(
-    soup: Soup, frame: FloatArray, low: FloatArray, high: FloatArray, instance: int, top: int = -1
-) -> None:
-    """Four walls and a lid between two corners given in ``frame``; ``top`` may look different."""
-    axis_x, axis_y, axis_z, origin = frame
-    wx, wy, wz = high - low
-    corner = origin + low @ frame[:3]
-    soup.quad(corner, wx * axis_x, wz * axis_z, instance)
-    soup.quad(corner + wx * axis_x, wy * axis_y, wz * axis_z, instance)
-    soup.quad(corner + wx * axis_x + wy * axis_y, -wx * axis_x, wz * axis_z, instance)
-    soup.quad(corner + wy * axis_y, -wy * axis_y, wz * axis_z, instance)
-    soup.quad(corner + wz * axis_z, wx * axis_x, wy * axis_y, instance if top < 0 else top)
-
-
-def tube(
-    soup: Soup, base: FloatArray, tip: FloatArray, radii: tuple[float, float], instance: int
-) -> None:
-    """Six-sided tapering tube from ``base`` to ``tip``, ``(3,)`` each."""
-    axis = (tip - base) / np.linalg.norm(tip - base)
-    side = np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.7 else [0.0, 1.0, 0.0])
-    side /= np.linalg.norm(side)
-    other = np.cross(axis, side)
-    angle = np.linspace(0.0, 2.0 * np.pi, 7)
-    ring = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * other  # (7, 3)
-    points = np.stack([base + radii[0] * ring, tip + radii[1] * ring])
-    height = float(np.linalg.norm(tip - base))
-    along = np.stack([angle * radii[0], angle * radii[0]])
-    soup.patch(points, np.stack([along, np.array([[0.0] * 7, [height] * 7])], axis=2), instance)
+from slam.simulation.shapes import UP, ball, box, colour, frame_at, tube
 
 
 def building(
@@ -150,24 +103,6 @@ def tree(
     for _ in range(int(rng.integers(3, 6))):
         centre = foot + lean * (trunk + 0.28 * size) + rng.normal(0.0, [0.14, 0.14, 0.10]) * size
         ball(soup, rng, centre, np.array([1.0, 1.0, 0.85]) * size * rng.uniform(0.16, 0.26), leaves)
-
-
-def ball(
-    soup: Soup, rng: np.random.Generator, centre: FloatArray, radii: FloatArray, instance: int
-) -> None:
-    """A lumpy ellipsoid of 6 x 9 faces."""
-    polar, around = np.linspace(0.0, np.pi, 7), np.linspace(0.0, 2.0 * np.pi, 10)
-    sin_polar = np.sin(polar)[:, None]
-    up = np.cos(polar)[:, None] * np.ones(10)
-    unit = np.stack([sin_polar * np.cos(around), sin_polar * np.sin(around), up], axis=2)
-    lump = rng.uniform(0.75, 1.2, (7, 10, 1))
-    lump[:, -1], lump[0], lump[-1] = lump[:, 0], 1.0, 1.0
-    points = centre + unit * lump * radii
-    uv = np.stack(
-        [np.broadcast_to(around * radii[0], (7, 10)), np.tile(polar[:, None] * radii[2], 10)],
-        axis=2,
-    )
-    soup.patch(points, uv, instance)
 
 
 def hedge(soup: Soup, rng: np.random.Generator, frame: FloatArray, length: float) -> None:

@@ -13,11 +13,12 @@ from scipy.ndimage import gaussian_filter1d
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
 from slam.simulation.geometry import Bend, FloatArray, road_bend, town_bend
-from slam.simulation.options import StreetKind, Variety
+from slam.simulation.variety import StreetKind, Variety
 
 Node = tuple[int, int]
 BoolArray = NDArray[np.bool_]
 
+KERB = 0.13  # height of pavements above the road, metres
 STEP = 0.25  # between samples of a path in the plan, metres
 OVERLAP = 67.0  # length of the start that a loop drives again, metres
 START = 25.0  # of a lone road, so that there is something behind the camera, metres

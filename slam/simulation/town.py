@@ -4,12 +4,13 @@ import numpy as np
 
 from slam.simulation import objects
 from slam.simulation.geometry import Bend, FloatArray, Material, Mesh, Soup
-from slam.simulation.route import StreetPlan
+from slam.simulation.open_land import open_land
+from slam.simulation.rectangle import Rectangle, corners_of, directed, frame_along, grid_over
+from slam.simulation.route import KERB, StreetPlan
+from slam.simulation.shapes import colour, frame_at
 
-KERB = 0.13  # height of pavements above the road, metres
 LANE = 3.6  # width on a motorway, metres
 ROUNDING = 5.0  # radius of kerbs at corners, metres
-Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1
 
 
 def build_town(plan: StreetPlan, bend: Bend, seed: int, varied: bool = False) -> Mesh:
@@ -22,9 +23,7 @@ def build_town(plan: StreetPlan, bend: Bend, seed: int, varied: bool = False) ->
             town.block(i, j)
     if plan.kind == "motorway":  # a barrier between the carriageways
         start, end = float(plan.xs[0]), float(plan.xs[-1])
-        objects.barrier(
-            town.soup, rng, objects.frame_at(start, 0.0, 0.0), end - start, rng.random() < 0.5
-        )
+        objects.barrier(town.soup, rng, frame_at(start, 0.0, 0.0), end - start, rng.random() < 0.5)
     town.backdrop()
     return town.soup.finish(bend)
 
@@ -43,11 +42,9 @@ class _Town:
         self.tallness = 1.0  # of trees at the kerb
         self.open = plan.kind in ("country", "motorway")  # no houses, no pavements
         self.foot = KERB - (0.1 if more is None else 0.6)  # of houses, below the ground on hills
-        grey = objects.colour(
-            rng, (0.36, 0.36, 0.37), (0.28, 0.28, 0.30), (0.42, 0.41, 0.39), spread=0.03
-        )
-        stone = objects.colour(rng, (0.55, 0.54, 0.52), (0.50, 0.46, 0.43), spread=0.04)
-        turf = objects.colour(rng, (0.26, 0.36, 0.14), (0.34, 0.38, 0.18), spread=0.02)
+        grey = colour(rng, (0.36, 0.36, 0.37), (0.28, 0.28, 0.30), (0.42, 0.41, 0.39), spread=0.03)
+        stone = colour(rng, (0.55, 0.54, 0.52), (0.50, 0.46, 0.43), spread=0.04)
+        turf = colour(rng, (0.26, 0.36, 0.14), (0.34, 0.38, 0.18), spread=0.02)
         paint = np.array([0.80, 0.80, 0.76])
         dash, fraction, edged = rng.uniform(3.0, 6.0), rng.uniform(0.35, 0.6), rng.random() < 0.7
         lanes = LANE if plan.kind == "motorway" else 0.0
@@ -107,9 +104,9 @@ class _Town:
             self._slab(rectangle, KERB, self.grass)
             return
         if a[1] == b[1]:
-            points, length = self._grid(rectangle, 0.0, 2.0), x1 - x0
+            points, length = grid_over(rectangle, 0.0, 2.0), x1 - x0
         else:
-            points, length = self._grid((y0, x0, y1, x1), 0.0, 2.0)[..., [1, 0, 2]], y1 - y0
+            points, length = grid_over((y0, x0, y1, x1), 0.0, 2.0)[..., [1, 0, 2]], y1 - y0
         rows, columns = points.shape[:2]
         half = self.plan.half_width
         v, u = np.meshgrid(
@@ -117,17 +114,9 @@ class _Town:
         )
         self.soup.patch(points, np.stack([u, v], axis=2), self.asphalt)
 
-    def _grid(self, rectangle: Rectangle, z: float, step: float) -> FloatArray:
-        """Vertices over a rectangle about ``step`` metres apart, ``(R, C, 3)``."""
-        x0, y0, x1, y1 = rectangle
-        x = np.linspace(x0, x1, max(1, int((x1 - x0) / step)) + 1)
-        y = np.linspace(y0, y1, max(1, int((y1 - y0) / step)) + 1)
-        gx, gy = np.meshgrid(x, y)
-        return np.stack([gx, gy, np.full_like(gx, z)], axis=2)
-
     def _slab(self, rectangle: Rectangle, z: float, instance: int, step: float = 3.0) -> None:
         """A level rectangle, textured by its plan coordinates."""
-        points = self._grid(rectangle, z, step)
+        points = grid_over(rectangle, z, step)
         self.soup.patch(points, points[..., :2], instance)
 
     def block(self, i: int, j: int) -> None:
@@ -143,17 +132,17 @@ class _Town:
         inner = (x0 + width, y0 + width, x1 - width, y1 - width)
         self._pavement((x0, y0, x1, y1), inner, sides)
         if self.open:
-            self._field(inner, sides)
+            open_land(self.soup, self.rng, plan.kind, self.grass, inner, sides)
             return
         self._slab(inner, KERB, self.grass if self.rng.random() < 0.7 else self.gravel)
-        corners = _corners((x0, y0, x1, y1))
+        corners = corners_of((x0, y0, x1, y1))
         for side in np.flatnonzero(sides):
             self._furnish(corners[side], corners[(side + 1) % 4])
         self._split(inner, inner, sides)
 
     def _pavement(self, outer: Rectangle, inner: Rectangle, sides: list[bool]) -> None:
         """A ring of paving between a rounded outline and the lots, and the kerb below its edge."""
-        rim, corners = [], _corners(outer)
+        rim, corners = [], corners_of(outer)
         for k in range(4):
             here, after, before = corners[k], corners[(k + 1) % 4], corners[k - 1]
             radius = ROUNDING if sides[k] and sides[k - 1] else 0.01
@@ -187,7 +176,7 @@ class _Town:
     def _furnish(self, start: FloatArray, end: FloatArray) -> None:
         """Trees, lamps and signs along one kerb, which has its block on the left, and cars in front of it."""
         rng = self.rng
-        length, ahead, inward, angle = _directed(start, end)
+        length, ahead, inward, angle = directed(start, end)
         along = 6.0
         while along < length - 6.0:
             spot = start + along * ahead + float(rng.uniform(0.55, 1.0)) * inward
@@ -206,9 +195,7 @@ class _Town:
             if rng.random() < self.parking:
                 spot = start + along * ahead - 0.95 * inward
                 objects.car(
-                    self.soup,
-                    rng,
-                    objects.frame_at(spot[0], spot[1], angle + rng.normal(0.0, 0.03)),
+                    self.soup, rng, frame_at(spot[0], spot[1], angle + rng.normal(0.0, 0.03))
                 )
             along += float(rng.uniform(5.4, 7.5))
         if self.more is None:
@@ -220,7 +207,7 @@ class _Town:
             first, last = np.sort(rng.uniform(6.0, length - 6.0, 2))
             foot = start + first * ahead + float(rng.uniform(0.2, 0.8)) * inward
             objects.railing(
-                self.soup, rng, objects.frame_at(foot[0], foot[1], angle, KERB), float(last - first)
+                self.soup, rng, frame_at(foot[0], foot[1], angle, KERB), float(last - first)
             )
         for _ in range(int(rng.poisson(length / 14.0))):
             spot = (
@@ -232,84 +219,6 @@ class _Town:
                 objects.person(self.soup, rng, float(spot[0]), float(spot[1]))
             else:
                 objects.post(self.soup, rng, float(spot[0]), float(spot[1]))
-
-    def _field(self, inner: Rectangle, sides: list[bool]) -> None:
-        """Open land that may rise beside the road to a bank, with trees, bushes, hedges, fences or barriers."""
-        rng, soup = self.rng, self.soup
-        rise, run = max(0.0, float(rng.uniform(-3.0, 5.0))), float(rng.uniform(3.0, 10.0))
-        low, high = np.array(inner[:2]), np.array(inner[2:])
-
-        def ground(x: FloatArray, y: FloatArray) -> FloatArray:
-            inwards = np.minimum(
-                np.minimum(x - low[0], high[0] - x), np.minimum(y - low[1], high[1] - y)
-            )
-            part = np.clip(inwards / run, 0.0, 1.0)
-            return np.asarray(KERB + rise * part * part * (3.0 - 2.0 * part))
-
-        points = self._grid(inner, 0.0, 2.0)
-        points[..., 2] = ground(points[..., 0], points[..., 1])
-        crop = objects.colour(
-            rng, (0.30, 0.36, 0.14), (0.55, 0.47, 0.26), (0.34, 0.27, 0.20), (0.24, 0.34, 0.13)
-        )
-        land = self.grass if rng.random() < 0.4 else soup.instance(Material.GRASS, crop, 0.6 * crop)
-        soup.patch(points, points[..., :2], land)
-        wood = float(rng.choice([0.0, 1.0, 4.0, 10.0]))  # trees in 100 square metres near the road
-        corners = _corners(inner)
-        for side in np.flatnonzero(sides):
-            start = corners[side]
-            length, ahead, inward, angle = _directed(start, corners[(side + 1) % 4])
-            frame = objects.frame_at(start[0], start[1], angle, KERB)
-            for _ in range(int(rng.poisson(0.15 * wood * length))):
-                far = 15.0 * rng.random() ** 1.5
-                x, y = start + rng.uniform(0.0, length) * ahead + far * inward
-                z = float(ground(np.array(x), np.array(y)))
-                if rng.random() < 0.4:
-                    green = objects.colour(
-                        rng, (0.20, 0.30, 0.12), (0.32, 0.34, 0.16), (0.14, 0.24, 0.10), spread=0.03
-                    )
-                    bush = soup.instance(Material.LEAVES, green, 0.45 * green)
-                    size = float(rng.uniform(0.5, 1.8))
-                    objects.ball(
-                        soup,
-                        rng,
-                        np.array([x, y, z + 0.4 * size]),
-                        np.array([1.0, 1.0, 0.8]) * size,
-                        bush,
-                    )
-                elif far > 1.5:
-                    objects.tree(
-                        soup, rng, float(x), float(y), float(rng.uniform(4.0, 13.0)), z - 0.2
-                    )
-            self._edge(frame, length)
-
-    def _edge(self, frame: FloatArray, length: float) -> None:
-        """What stands between a road and the open land beside it."""
-        rng, soup, kind = self.rng, self.soup, self.rng.random()
-        if self.plan.kind == "motorway":
-            if kind < 0.75:
-                objects.barrier(soup, rng, frame, length, kind < 0.25)
-            elif kind < 0.87:  # against the noise
-                stone = objects.colour(
-                    rng, (0.55, 0.53, 0.48), (0.40, 0.45, 0.40), (0.45, 0.38, 0.30)
-                )
-                wall = soup.instance(Material.BOARDS, stone, 0.6 * stone, (0.5,))
-                objects.box(
-                    soup,
-                    frame,
-                    np.zeros(3),
-                    np.array([length, 0.3, float(rng.uniform(2.5, 5.0))]),
-                    wall,
-                )
-        elif kind < 0.3:
-            objects.wire_fence(soup, rng, frame, length)
-        elif kind < 0.4:
-            objects.hedge(soup, rng, frame, length)
-        elif kind < 0.6:
-            for along in np.arange(3.0, length, float(rng.uniform(7.0, 14.0))):
-                x, y, _ = frame[3] + along * frame[0] + 0.5 * frame[1]
-                objects.tree(soup, rng, float(x), float(y), float(rng.uniform(6.0, 12.0)))
-        elif kind < 0.75:
-            objects.barrier(soup, rng, frame, length, False)
 
     def _split(self, lot: Rectangle, inner: Rectangle, sides: list[bool]) -> None:
         """Cut a lot in two until each piece is of the size of a house."""
@@ -332,17 +241,17 @@ class _Town:
             front = float(rng.uniform(0.0, 3.0)) if facing else 1.0
             gap = float(rng.choice([0.02, rng.uniform(0.4, 1.6)]))
             width, depth = (x1 - x0, y1 - y0) if side % 2 == 0 else (y1 - y0, x1 - x0)
-            frame = _side(lot, side, self.foot)
+            frame = frame_along(lot, side, self.foot)
             frame[3] += gap * frame[0] + front * frame[1]
             deep = min(depth - front - 0.2, float(rng.uniform(7.0, 14.0)))
             objects.building(self.soup, rng, frame, width - 2 * gap, deep)
             if front > 1.4 and rng.random() < 0.5:
-                objects.hedge(self.soup, rng, _side(lot, side, KERB - 0.05), 0.6 * width)
+                objects.hedge(self.soup, rng, frame_along(lot, side, KERB - 0.05), 0.6 * width)
             return
         for side in facing:
             if rng.random() < 0.6:
                 length = (x1 - x0 if side % 2 == 0 else y1 - y0) * float(rng.uniform(0.5, 1.0))
-                objects.hedge(self.soup, rng, _side(lot, side, KERB - 0.05), length)
+                objects.hedge(self.soup, rng, frame_along(lot, side, KERB - 0.05), length)
         for _ in range(int(rng.poisson(3.0 * self.greenery))):
             x, y = rng.uniform(x0 + 1.5, x1 - 1.5), rng.uniform(y0 + 1.5, y1 - 1.5)
             objects.tree(self.soup, rng, float(x), float(y), float(rng.uniform(4.0, 10.0)))
@@ -350,9 +259,9 @@ class _Town:
     def backdrop(self) -> None:
         """Trees and houses beyond the edge of town, so that no street ends in the sky."""
         rng, xs, ys = self.rng, self.plan.xs, self.plan.ys
-        corners = _corners((xs[0], ys[0], xs[-1], ys[-1]))
+        corners = corners_of((xs[0], ys[0], xs[-1], ys[-1]))
         for side, start in enumerate(corners):
-            length, ahead, inward, _ = _directed(start, corners[(side + 1) % 4])
+            length, ahead, inward, _ = directed(start, corners[(side + 1) % 4])
             for along in np.arange(0.0, length, 9.0):
                 spot = (
                     start + (along + rng.uniform(-3, 3)) * ahead - rng.uniform(6.0, 25.0) * inward
@@ -360,26 +269,7 @@ class _Town:
                 if rng.random() < (1.0 if self.open else 0.7):
                     objects.tree(self.soup, rng, spot[0], spot[1], float(rng.uniform(6.0, 13.0)))
                 else:
-                    frame = objects.frame_at(spot[0], spot[1], side * np.pi / 2.0 + np.pi, -0.3)
+                    frame = frame_at(spot[0], spot[1], side * np.pi / 2.0 + np.pi, -0.3)
                     objects.building(
                         self.soup, rng, frame, float(rng.uniform(8, 14)), float(rng.uniform(7, 11))
                     )
-
-
-def _corners(rectangle: Rectangle) -> FloatArray:
-    """South west, south east, north east and north west, ``(4, 2)``."""
-    x0, y0, x1, y1 = rectangle
-    return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
-
-
-def _side(rectangle: Rectangle, number: int, z: float) -> FloatArray:
-    """Frame along a side, counterclockwise from the south."""
-    x, y = _corners(rectangle)[number]
-    return objects.frame_at(x, y, number * np.pi / 2.0, z)
-
-
-def _directed(start: FloatArray, end: FloatArray) -> tuple[float, FloatArray, FloatArray, float]:
-    """Length of an edge in the plan, its direction ``(2,)``, the one to its left, and its angle from east."""
-    length = float(np.linalg.norm(end - start))
-    ahead = (end - start) / max(length, 1e-9)
-    return length, ahead, np.array([-ahead[1], ahead[0]]), float(np.arctan2(ahead[1], ahead[0]))

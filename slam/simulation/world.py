@@ -17,9 +17,12 @@ from slam.geometry import se3
 from slam.runtime.imports import import_open3d
 from slam.simulation.geometry import Float32Array, FloatArray, Material, Mesh
 from slam.simulation.options import SimulationOptions
-from slam.simulation.texture import SHADERS, Texels
+from slam.simulation.room_textures import ROOM_SHADERS
+from slam.simulation.street_textures import STREET_SHADERS
+from slam.simulation.texture import Texels
 
 FARTHEST_M = 200.0  # surfaces beyond are treated as sky
+SHADERS = STREET_SHADERS | ROOM_SHADERS
 SHUTTER = 0.5  # exposure time of a blurred image over the frame interval
 
 

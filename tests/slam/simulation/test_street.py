@@ -1,19 +1,11 @@
-import json
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
-import yaml
 
-from slam.frames import Intrinsics
 from slam.geometry import se3
-from slam.runtime.errors import SequenceError
-from slam.simulation.geometry import FLAT, Material, Soup
-from slam.simulation.kitti_layout import write_kitti_root
-from slam.simulation.options import SimulationOptions, draw_variety
+from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
-from slam.simulation.world import Surface, place_rays
+from slam.simulation.variety import draw_variety
 
 SMALL = {"width": 208, "height": 64}
 
@@ -172,98 +164,6 @@ def test_kiss_icp_follows_the_scans(straight: SimulatedStreet) -> None:
         odometry.register_frame(straight.scan(k)[:, :3].astype(np.float64), np.array([]))
     truth = np.linalg.norm(straight.T_world_camera[14, :3, 3] - straight.T_world_camera[0, :3, 3])
     assert np.linalg.norm(odometry.last_pose[:3, 3]) == pytest.approx(truth, rel=0.03)
-
-
-def test_kitti_root_holds_what_was_rendered(tmp_path: Path) -> None:
-    street = SimulatedStreet(SimulationOptions("straight", 3, 712, **SMALL))
-    root, written = tmp_path / "deep" / "world", []
-    write_kitti_root(street, root, depth=True, lidar=True, progress=written.append)
-    assert written == [1, 2, 3]
-    assert sorted(p.name for p in root.iterdir()) == [
-        "camera.yaml",
-        "poses",
-        "sequences",
-        "simulation.json",
-    ]
-    sequence, frame = root / "sequences" / "sim", street.render(2)
-    assert np.array_equal(
-        cv2.imread(str(sequence / "image_2" / "000002.png"))[..., ::-1], frame.image
-    )
-    encoded = cv2.imread(str(sequence / "depth_2" / "000002.png"), cv2.IMREAD_UNCHANGED)
-    assert encoded.dtype == np.uint16 and ((encoded == 0) == (frame.depth == 0)).all()
-    assert np.abs(encoded / 256.0 - frame.depth).max() <= 0.5 / 256 + 1e-6
-    scan = np.fromfile(sequence / "velodyne" / "000001.bin", np.float32).reshape(-1, 4)
-    assert np.array_equal(scan, street.scan(1))
-    assert np.loadtxt(sequence / "times.txt") == pytest.approx([0.0, 0.1, 0.2])
-    assert np.loadtxt(root / "poses" / "sim.txt").reshape(3, 3, 4) == pytest.approx(
-        street.T_world_camera[:, :3]
-    )
-    rows = dict(line.split(": ") for line in (sequence / "calib.txt").read_text().splitlines())
-    assert list(rows) == ["P0", "P1", "P2", "P3", "Tr"] and rows["P0"] == rows["P2"]
-    assert np.fromstring(rows["P2"], sep=" ").reshape(3, 4)[:, :3] == pytest.approx(street.K)
-    assert np.fromstring(rows["Tr"], sep=" ").reshape(3, 4) == pytest.approx(
-        street.T_camera_lidar[:3]
-    )
-    camera = yaml.safe_load((root / "camera.yaml").read_text())
-    assert (camera["width"], camera["height"], camera["model"]) == (208, 64, "pinhole")
-    assert camera["camera_height_m"] == pytest.approx(street.camera_height_m)
-    assert json.loads((root / "simulation.json").read_text())["seed"] == 712
-    with pytest.raises(SequenceError, match="not empty"):
-        write_kitti_root(street, root)
-
-
-CAMERA = Intrinsics(64, 32, 100.0, 50.0, 31.5, 15.5)
-# a camera that looks east: right is south, down is down
-T_SCENE_CAMERA = se3.make(
-    np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.0, 0.0, 1.5])
-)
-
-
-@pytest.mark.parametrize("slope", [0.0, 0.1, -0.1])
-def test_depth_of_a_slope_is_that_of_hand(slope: float) -> None:
-    soup = Soup(np.random.default_rng(0))
-    ground = soup.instance(Material.ASPHALT, np.full(3, 0.3))
-    soup.quad(
-        np.array([0.0, -500.0, 0.0]),
-        np.array([900.0, 0.0, 900.0 * slope]),
-        np.array([0.0, 1000.0, 0.0]),
-        ground,
-    )
-    rays = place_rays(
-        T_SCENE_CAMERA, CAMERA.rays(CAMERA.pixel_grid()).reshape(-1, 3).astype(np.float32)
-    )
-    depth = Surface(soup.finish(FLAT)).cast(rays)["t_hit"].reshape(32, 64)
-    row = np.arange(22, 32)
-    expected = 1.5 / ((row - 15.5) / 50.0 + slope)  # 1.5 - depth (v - cy) / fy = slope depth
-    np.testing.assert_allclose(
-        depth[22:], np.where(expected > 0.0, expected, np.inf)[:, None].repeat(64, 1), rtol=1e-5
-    )
-
-
-def test_varieties_cover_streets_and_cameras() -> None:
-    drawn = [draw_variety(seed, lone_road=True) for seed in range(300)]
-    assert {one.kind for one in drawn} == {"town", "avenue", "country", "motorway"}
-    for values, low, high in (
-        ([one.fov_deg for one in drawn], 50.0, 110.0),
-        ([one.height_m for one in drawn], 0.5, 2.5),
-        ([np.rad2deg(one.roll) for one in drawn], -2.0, 2.0),
-        ([one.steepness for one in drawn], 0.0, 0.1),
-    ):
-        assert (
-            low <= min(values) < low + 0.1 * (high - low)
-            and high - 0.1 * (high - low) < max(values) <= high
-        )
-    assert 0.1 < np.mean([one.bonnet > 0.0 for one in drawn]) < 0.4
-    assert all(draw_variety(seed, lone_road=False).kind != "motorway" for seed in range(60))
-
-
-def test_a_camera_keeps_its_field_of_view_when_its_image_is_shrunk() -> None:
-    one = next(
-        one for one in (draw_variety(seed, True) for seed in range(50)) if one.aspect is not None
-    )
-    K = one.camera(416, 128).K
-    assert 2.0 * np.rad2deg(np.arctan(208.0 / K[0, 0])) == pytest.approx(one.fov_deg)
-    assert K[1, 1] / K[0, 0] == pytest.approx(one.aspect * 128 / 416)
 
 
 @pytest.mark.slow

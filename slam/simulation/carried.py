@@ -1,0 +1,210 @@
+"""The motion of a camera that is carried: legs between places, turns, sweeps and rests, with its carrier's unrest."""
+
+from dataclasses import dataclass
+from typing import get_args
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from slam.geometry import se3
+from slam.simulation.floor import Floor
+from slam.simulation.geometry import FloatArray
+from slam.simulation.options import Motion
+
+CLOCK = 120.0  # samples of a motion a second
+FASTEST_TURN_DEG = 17.0  # a frame
+_STRIDE_M = 0.72
+_SETTLED_S = 0.15  # over which turns and starts are smoothed
+_CARRIER_CLEAR_M = 0.4  # of the carrier in the plan, where nothing is swayed any further
+
+
+@dataclass(frozen=True)
+class Gait:
+    """How one kind of carrier moves."""
+
+    height_m: tuple[float, float]  # of the camera, lowest and highest
+    climb_m: float  # by how much the height wanders on the way
+    speed: float  # metres a second
+    turn_deg: float  # a second, at most, on the spot
+    rests: tuple[float, float, float]  # how often it turns, sweeps and stands still at a place
+    bob_m: float  # up and down with every step
+    sway_m: float  # to the sides with every second step, and by unrest
+    wander_deg: float  # how far it looks to the sides, and by a third of it up and down, on its way
+    tremor_deg: float  # of the hand or the motors
+    pitch_deg: float  # of the camera, upwards
+
+
+GAITS: dict[str, Gait] = {
+    "walk": Gait((1.45, 1.7), 0.02, 1.1, 80.0, (0.5, 0.2, 0.3), 0.025, 0.03, 10.0, 0.25, -3.0),
+    "look": Gait((1.45, 1.7), 0.05, 0.8, 70.0, (1.6, 1.0, 0.4), 0.02, 0.03, 14.0, 0.3, -2.0),
+    "phone": Gait((1.2, 1.5), 0.08, 0.8, 110.0, (0.8, 0.8, 0.4), 0.015, 0.04, 22.0, 0.5, -10.0),
+    "drone": Gait((1.0, 1.25), 0.2, 0.9, 70.0, (0.6, 0.5, 0.3), 0.0, 0.05, 30.0, 0.15, -5.0),
+    "robot": Gait((0.32, 0.45), 0.0, 0.5, 60.0, (0.8, 0.0, 0.3), 0.0, 0.0, 0.0, 0.04, 4.0),
+}
+assert tuple(GAITS) == get_args(Motion)
+
+
+class Carried:
+    """A motion, ``CLOCK`` samples a second.
+
+    Its channels ``(M, 6)`` are x, y, z in metres, yaw to the left from east, pitch upwards and roll in radians.
+    """
+
+    def __init__(self, floor: Floor, motion: str, seconds: float, rate: float, seed: int) -> None:
+        """A motion of so many seconds for a camera of ``rate`` frames a second."""
+        rng, gait = np.random.default_rng([seed, 53, *motion.encode()]), GAITS[motion]
+        turn = np.deg2rad(min(gait.turn_deg, 0.9 * FASTEST_TURN_DEG * rate))
+        base, moved = _Walk(floor, gait, turn, rng).over(int(np.ceil(seconds * CLOCK)) + 2)
+        base = gaussian_filter1d(base, _SETTLED_S * CLOCK, axis=0, mode="nearest")
+        moved = gaussian_filter1d(moved, _SETTLED_S * CLOCK, mode="nearest")
+        count = len(base)
+        x, y, yaw, pitch = base.T
+        step = np.cumsum(moved * gait.speed / CLOCK) / _STRIDE_M * 2.0 * np.pi
+        free = np.clip(floor.clearance(base[:, :2]) - _CARRIER_CLEAR_M, 0.0, 1.0)
+        side = moved * gait.sway_m * np.sin(0.5 * step) + gait.sway_m * _unrest(rng, count, 0.6)
+        side = np.clip(side, -free, free)
+        unsteady = np.deg2rad(gait.tremor_deg)
+        wander = np.deg2rad(gait.wander_deg) * (0.3 + 0.7 * moved)
+        tremors = [
+            unsteady * (_unrest(rng, count, 0.05) + 0.7 * _unrest(rng, count, 0.25))
+            for _ in range(3)
+        ]
+        height = rng.uniform(*gait.height_m) + gait.climb_m * _unrest(rng, count, 1.5)
+        z = height + moved * gait.bob_m * np.cos(step)
+        yaw = yaw + wander * _unrest(rng, count, 0.9) + tremors[0]
+        pitch = (
+            pitch
+            + np.deg2rad(gait.pitch_deg)
+            + wander / 3.0 * _unrest(rng, count, 0.9)
+            + tremors[1]
+        )
+        roll = (
+            4.0 * unsteady * _unrest(rng, count, 0.8)
+            + 0.3 * moved * gait.sway_m * np.cos(0.5 * step)
+            + tremors[2]
+        )
+        self._channels = np.stack(
+            [x + side * np.sin(yaw), y - side * np.cos(yaw), z, yaw, pitch, roll], axis=1
+        )
+
+    def at(self, seconds: FloatArray) -> FloatArray:
+        """The channels at times ``(N,)``, ``(6, N)``."""
+        clock = np.arange(len(self._channels)) / CLOCK
+        return np.stack([np.interp(seconds, clock, channel) for channel in self._channels.T])
+
+    def poses(self, seconds: FloatArray) -> FloatArray:
+        """``T_scene_camera`` at times ``(N,)``, ``(N, 4, 4)``."""
+        x, y, z, yaw, pitch, roll = self.at(seconds)
+        level, zero = np.cos(pitch), np.zeros_like(x)
+        forward = np.stack([np.cos(yaw) * level, np.sin(yaw) * level, np.sin(pitch)], axis=1)
+        right = np.stack([np.sin(yaw), -np.cos(yaw), zero], axis=1)
+        upright = se3.make(
+            np.stack([right, np.cross(forward, right), forward], axis=2),
+            np.stack([x, y, z], axis=1),
+        )
+        return upright @ se3.from_rotation_vector(
+            np.stack([zero, zero, roll], axis=1), np.zeros((len(x), 3))
+        )
+
+
+def _unrest(rng: np.random.Generator, count: int, seconds: float) -> FloatArray:
+    """Noise of unit deviation within two and a half that is smooth over a time, ``(count,)``."""
+    sigma = seconds * CLOCK
+    margin = int(4.0 * sigma)
+    noise = gaussian_filter1d(rng.standard_normal(count + 2 * margin), sigma)[
+        margin : margin + count
+    ]
+    return np.asarray(np.clip(noise * np.sqrt(3.54 * sigma), -2.5, 2.5))
+
+
+class _Walk:
+    """Strings legs and rests together: x, y, yaw and pitch at every tick, and whether one walks."""
+
+    def __init__(self, floor: Floor, gait: Gait, turn: float, rng: np.random.Generator) -> None:
+        self._floor, self._gait, self._turn, self._rng = floor, gait, turn, rng
+        self._visits = np.zeros(int(floor.room.max()) + 1)
+        self._place = int(rng.integers(len(floor.places)))
+        self._yaw = float(rng.uniform(-np.pi, np.pi))
+        self._parts: list[FloatArray] = []
+        self._moved: list[FloatArray] = []
+
+    def over(self, ticks: int) -> tuple[FloatArray, FloatArray]:
+        """So many ticks: ``(ticks, 4)`` and ``(ticks,)``."""
+        while sum(map(len, self._moved)) < ticks:
+            self._leg()
+            for act, share in zip((self._look_round, self._sweep, self._stand), self._gait.rests):
+                for _ in range(int(share + self._rng.random())):
+                    act()
+        return np.concatenate(self._parts)[:ticks], np.concatenate(self._moved)[:ticks]
+
+    def _leg(self) -> None:
+        """Walk to another place, rather a near one in a room that was seldom visited."""
+        floor, rng = self._floor, self._rng
+        self._visits[floor.room[self._place]] += 1
+        longing = (
+            floor.lengths(self._place)
+            + 8.0 * self._visits[floor.room]
+            + rng.uniform(0.0, 8.0, len(floor.places))
+        )
+        longing[self._place] = np.inf
+        goal = int(np.argmin(longing))
+        path = floor.path(self._place, goal)
+        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+        along = np.linspace(0.0, length[-1], max(int(length[-1] / 0.02), 8))
+        path = np.stack([np.interp(along, length, axis) for axis in path.T], axis=1)
+        ahead = np.minimum(np.arange(len(path)) + 25, len(path) - 1)
+        ahead[-25:] = len(path) - 1
+        behind = (
+            np.minimum(np.arange(len(path)), len(path) - 26)
+            if len(path) > 26
+            else np.zeros(len(path), dtype=int)
+        )
+        towards = path[ahead] - path[behind]
+        heading = np.unwrap(np.arctan2(towards[:, 1], towards[:, 0]))
+        self._turn_by(float((heading[0] - self._yaw + np.pi) % (2.0 * np.pi) - np.pi))
+        heading += self._yaw - heading[0]
+        pace = np.minimum(np.minimum(along, along[-1] - along) + 0.15, 0.5) / 0.5 * self._gait.speed
+        walking, turning = np.diff(along) / pace[1:], np.abs(np.diff(heading)) / (0.8 * self._turn)
+        arrival = np.concatenate([[0.0], np.cumsum(np.maximum(walking, turning))])
+        ticks = np.arange(1, int(arrival[-1] * CLOCK) + 1) / CLOCK
+        at = np.interp(ticks, arrival, np.arange(len(path)))
+        rows = np.arange(len(path))
+        track = [np.interp(at, rows, channel) for channel in (path[:, 0], path[:, 1], heading)]
+        self._add(
+            np.stack([*track, np.zeros_like(at)], axis=1),
+            np.interp(at, rows, pace) / self._gait.speed,
+        )
+        self._yaw, self._place = float(heading[-1]), goal
+
+    def _look_round(self) -> None:
+        """Turn on the spot."""
+        self._turn_by(
+            float(self._rng.choice([-1.0, 1.0]) * np.deg2rad(self._rng.uniform(60.0, 360.0)))
+        )
+
+    def _sweep(self) -> None:
+        """Look left and right, up and down."""
+        wide, high = np.deg2rad(self._rng.uniform((20.0, 8.0), (45.0, 25.0)))
+        seconds = max(float(self._rng.uniform(3.0, 5.0)), 2.0 * np.pi * wide / self._turn)
+        phase = np.linspace(0.0, 2.0 * np.pi, int(seconds * CLOCK))
+        self._stay(self._yaw + wide * np.sin(phase), high * np.sin(2.0 * phase))
+
+    def _stand(self) -> None:
+        still = np.zeros(int(self._rng.uniform(0.7, 2.0) * CLOCK))
+        self._stay(still + self._yaw, still)
+
+    def _turn_by(self, angle: float) -> None:
+        s = np.linspace(0.0, 1.0, int(1.5 * abs(angle) / self._turn * CLOCK) + 2)
+        self._stay(self._yaw + angle * s * s * (3.0 - 2.0 * s), np.zeros_like(s))
+        self._yaw += angle
+
+    def _stay(self, yaw: FloatArray, pitch: FloatArray) -> None:
+        x, y = self._parts[-1][-1, :2] if self._parts else self._floor.places[self._place]
+        self._add(
+            np.stack([np.full_like(yaw, x), np.full_like(yaw, y), yaw, pitch], axis=1),
+            np.zeros_like(yaw),
+        )
+
+    def _add(self, part: FloatArray, moved: FloatArray) -> None:
+        self._parts.append(part)
+        self._moved.append(moved)

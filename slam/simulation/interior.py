@@ -1,0 +1,237 @@
+"""A furnished house: its walls, floors and ceilings, and the furniture and lamps in its rooms."""
+
+import functools
+from itertools import pairwise
+
+import numpy as np
+
+from slam.simulation.furniture import CLOTHS, PAINTS, STANDING, TALL, WOODS, Piece, dining
+from slam.simulation.geometry import FLAT, FloatArray, Material, Soup
+from slam.simulation.house import WALL, Room, draw_house
+from slam.simulation.rectangle import Rectangle
+from slam.simulation.shapes import colour, frame_at, plate, solid
+
+DOOR_HEIGHT = 2.1
+_WALLS = (
+    (0.86, 0.84, 0.79),
+    (0.80, 0.82, 0.84),
+    (0.78, 0.72, 0.60),
+    (0.66, 0.72, 0.68),
+    (0.74, 0.62, 0.56),
+)
+_AISLE = 1.0  # left free between the furniture at the walls and the table in the middle, metres
+_DEEPEST = 0.65  # piece at a wall, metres
+_STEP = 0.5  # between the vertices of walls, which carry the light, metres
+
+
+class Interior:
+    """A furnished house: its walls, furniture and lamps.
+
+    Attributes:
+        house: its plan.
+        mesh: all surfaces.
+        obstacles: what stands on the floors, in plan.
+        lights: position and strength of lamps and windows, ``(L, 4)``.
+    """
+
+    def __init__(self, seed: int) -> None:
+        """The house of a world."""
+        self.rng = rng = np.random.default_rng([seed, 51])
+        self.house, self.soup = draw_house(seed), Soup(rng)
+        self.obstacles: list[Rectangle] = []
+        self._lights: list[tuple[float, float, float, float]] = []
+        self.frame_look = self.soup.instance(Material.WOOD, colour(rng, *WOODS))
+        self.skirting = colour(rng, (0.85, 0.84, 0.80), *WOODS)
+        for room in self.house.rooms:
+            self._enclose_and_fill(room)
+        for door in self.house.doors:
+            self._doorway(door)
+        self.mesh, self.lights = self.soup.finish(FLAT), np.array(self._lights)
+
+    def _enclose_and_fill(self, room: Room) -> None:
+        """Everything inside the walls of a room."""
+        rng, (x0, y0, x1, y1) = self.rng, room.area
+        east, north = np.array([x1 - x0, 0.0, 0.0]), np.array([0.0, y1 - y0, 0.0])
+        if room.kind in ("living", "bedroom", "office"):
+            floor = self.soup.instance(
+                Material.BOARDS, colour(rng, *WOODS), None, (rng.uniform(0.07, 0.16),)
+            )
+        else:
+            side = float(rng.uniform(0.9, 1.3) if room.kind == "hall" else rng.uniform(0.2, 0.5))
+            tone = colour(rng, (0.62, 0.60, 0.57), (0.50, 0.51, 0.53), (0.68, 0.58, 0.46))
+            chequered = float(room.kind in ("bath", "kitchen") and rng.random() < 0.4)
+            floor = self.soup.instance(Material.TILES, tone, 0.75 * tone, (side, 0.008, chequered))
+        self._panel(np.array([x0, y0, 0.0]), east, north, floor)
+        ceiling = self.soup.instance(Material.PLASTER, colour(rng, (0.88, 0.88, 0.86), spread=0.02))
+        self._panel(np.array([x0, y0, room.height]), north, east, ceiling)
+        tone = colour(rng, *_WALLS, spread=0.04)
+        if room.kind == "bath":
+            wall = self.soup.instance(
+                Material.TILES, tone, 0.8 * tone, (float(rng.uniform(0.1, 0.25)), 0.006)
+            )
+        else:
+            papered = float(rng.uniform(0.1, 0.3)) if rng.random() < 0.2 else 0.0
+            wall = self.soup.instance(Material.PLASTER, tone, self.skirting, (0.08, papered, 0.08))
+        for number in range(4):
+            self._furnish(room, number, wall)
+        self._fill_middle(room)
+        self._lamps(room)
+
+    def _doorway(self, door: Rectangle) -> None:
+        """Jambs, lintel and threshold of an opening."""
+        x0, y0, x1, y1 = door
+        east, north, up = (
+            np.array([x1 - x0, 0, 0]),
+            np.array([0, y1 - y0, 0]),
+            np.array([0, 0, DOOR_HEIGHT]),
+        )
+        corner = np.array([x0, y0, 0.0])
+        if x1 - x0 > WALL + 0.01:
+            jambs = (corner, north), (corner + east + north, -north)
+        else:
+            jambs = (corner + east, -east), (corner + north, east)
+        lintel, threshold = (corner + up, north, east), (corner, east, north)
+        for quad in (*((foot, along, up) for foot, along in jambs), lintel, threshold):
+            self.soup.quad(*quad, self.frame_look)
+
+    def _panel(self, corner: FloatArray, along: FloatArray, up: FloatArray, look: int) -> None:
+        """A parallelogram with vertices at most ``_STEP`` apart, textured in metres from its corner."""
+        width, height = float(np.linalg.norm(along)), float(np.linalg.norm(up))
+        a, b = (
+            np.linspace(0.0, 1.0, int(np.ceil(extent / _STEP)) + 1) for extent in (width, height)
+        )
+        points = corner + a[None, :, None] * along + b[:, None, None] * up
+        u, v = np.meshgrid(a * width, b * height + corner[2] * (up[2] > 0.0))
+        self.soup.patch(points, np.stack([u, v], axis=2), look)
+
+    def _furnish(self, room: Room, number: int, wall: int) -> None:
+        """One wall around its doors, seen from inside; furniture along it, pictures above that and windows."""
+        rng, openings = self.rng, self.house.openings(room, number)
+        (x, y), angle, length = room.side(number)
+        ahead, up = np.array([np.cos(angle), np.sin(angle), 0.0]), np.array([0.0, 0.0, 1.0])
+        for k, (start, end) in enumerate(pairwise([0.0, *np.ravel(openings), length])):
+            low = DOOR_HEIGHT * (k % 2)
+            self._panel(
+                np.array([x, y, low]) + end * ahead,
+                (start - end) * ahead,
+                (room.height - low) * up,
+                wall,
+            )
+        doors = [(a - 0.35, b + 0.35) for a, b in openings]
+        windows = self._windows(room, number)
+        density = {"corridor": 0.15, "hall": 0.7, "bath": 0.6}.get(room.kind, 0.8)
+        pieces = STANDING[room.kind]
+        left = 0.7
+        while True:
+            piece, width, depth = pieces[rng.integers(len(pieces))]
+            width = min(width, length - 0.05 - left)
+            if width < 0.6:
+                return
+            blocked = [end for start, end in doors if start < left + width and end > left]
+            if blocked:
+                left = max(blocked) + 0.02
+                continue
+            daylight = any(a < left + width and b > left for a, b in windows)
+            frame = frame_at(x, y, angle)
+            frame[3] += left * frame[0] + 0.01 * frame[1]
+            stands = rng.random() < density and not (daylight and piece in TALL)
+            if stands:
+                self._place(piece, frame, width, depth)
+            if not daylight and not (stands and piece in TALL) and rng.random() < 0.6:
+                self._hang(frame, width)
+            left += width + float(rng.uniform(0.05, 0.5))
+
+    def _place(self, piece: Piece, frame: FloatArray, width: float, depth: float) -> None:
+        piece(self.soup, self.rng, frame, width)
+        corners = np.stack([frame[3], frame[3] + width * frame[0] + depth * frame[1]])
+        self.obstacles.append((*corners.min(axis=0)[:2], *corners.max(axis=0)[:2]))
+
+    def _hang(self, frame: FloatArray, width: float) -> None:
+        """A picture, a poster, a mirror or a screen at the height of the eyes."""
+        rng = self.rng
+        across, high = float(rng.uniform(0.4, min(width, 1.2))), float(rng.uniform(0.4, 0.8))
+        first, second = colour(rng, *PAINTS), colour(rng, *CLOTHS)
+        kind = rng.random()
+        if kind < 0.75:
+            look = self.soup.instance(
+                Material.PICTURE, first, second, (across, high, float(rng.integers(3)))
+            )
+        elif kind < 0.9:
+            look = self.soup.instance(Material.SCREEN, first, second, (across, high))
+        else:
+            look = self.soup.instance(
+                Material.PANE, np.array([0.72, 0.76, 0.78]), self.skirting, (across, high, 0.0)
+            )
+        low = (
+            float(rng.uniform(0.0, width - across)),
+            0.0,
+            1.6 - 0.5 * high + float(rng.uniform(-0.1, 0.15)),
+        )
+        plate(self.soup, frame, low, (across, 0.02, high), look, self.frame_look)
+
+    def _windows(self, room: Room, number: int) -> list[tuple[float, float]]:
+        """Panes in an outside wall, which light the room; where they begin and end along it."""
+        if number not in room.outside:
+            return []
+        rng = self.rng
+        (x, y), angle, length = room.side(number)
+        low, high = (1.6, 1.6) if room.kind == "hall" else (0.95, 1.2)
+        width = min(float(rng.uniform(1.0, 1.7)), length - 0.4)
+        spans, left = [], float(rng.uniform(0.2, 0.9))
+        while left + width < length - 0.1:
+            frame = frame_at(x, y, angle)
+            sky = np.array([0.86, 0.92, 0.98]) * float(rng.uniform(0.9, 1.05))
+            pane = self.soup.instance(Material.PANE, sky, self.skirting, (width, high, 1.0))
+            plate(self.soup, frame, (left, 0.0, low), (width, 0.01, high), pane, self.frame_look)
+            x_light, y_light, _ = frame[3] + (left + 0.5 * width) * frame[0] + 0.8 * frame[1]
+            strength = (0.35 if room.kind == "hall" else 0.7) * width * high
+            self._lights.append((x_light, y_light, low + 0.6 * high, strength))
+            spans.append((left, left + width))
+            left += width + float(rng.uniform(0.5, 2.5))
+        return spans
+
+    def _fill_middle(self, room: Room) -> None:
+        """A table or a carpet; rows of racks in the hall."""
+        rng, (x0, y0, x1, y1) = self.rng, room.area
+        low = np.array([x0, y0]) + _DEEPEST + _AISLE
+        free = np.array([x1, y1]) - _DEEPEST - _AISLE - low
+        if room.kind == "hall":
+            for y in np.arange(low[1], low[1] + free[1] - 0.5, 0.6 + 1.5):
+                left = low[0]
+                while left < x1 - _DEEPEST - _AISLE - 1.0:
+                    piece, width, depth = STANDING["hall"][rng.integers(3)]
+                    width = min(width, x1 - _DEEPEST - _AISLE - left)
+                    self._place(piece, frame_at(left, float(y), 0.0), width, depth)
+                    left += width + float(rng.choice([0.05, 1.3], p=[0.6, 0.4]))
+            return
+        if room.kind in ("living", "bedroom", "office") and free.min() > 0.2:
+            size = np.minimum(free + 1.0, 2.6)
+            tone, other = colour(rng, *CLOTHS), colour(rng, *PAINTS)
+            carpet = self.soup.instance(
+                Material.CARPET, tone, other, (size[0], size[1], float(rng.uniform(0.2, 0.5)))
+            )
+            corner = np.array([*(low + 0.5 * (free - size)), 0.01])
+            self.soup.quad(corner, np.array([size[0], 0, 0]), np.array([0, size[1], 0]), carpet)
+        if free[0] > 0.8 and free[1] > 1.2 and rng.random() < 0.8:
+            width, depth = min(free[0], 1.8), min(free[1] - 0.6, 0.9)
+            x, y = low + 0.5 * (free - np.array([width, depth]))
+            dining(self.soup, rng, frame_at(float(x), float(y), 0.0), width, depth)
+            self.obstacles.append(
+                (float(x), float(y) - 0.3, float(x) + width, float(y) + depth + 0.3)
+            )
+
+    def _lamps(self, room: Room) -> None:
+        """Flat lamps below the ceiling, about 3 m apart."""
+        rng, (x0, y0, x1, y1) = self.rng, room.area
+        bulb = self.soup.instance(Material.LAMP, np.array([1.0, 0.98, 0.92]))
+        strength = (0.8 if room.kind == "hall" else 1.0) * float(rng.uniform(0.8, 1.2))
+        across, along = (max(1, round((extent) / 3.4)) for extent in (x1 - x0, y1 - y0))
+        for x in x0 + (np.arange(across) + 0.5) / across * (x1 - x0):
+            for y in y0 + (np.arange(along) + 0.5) / along * (y1 - y0):
+                frame = frame_at(x - 0.25, y - 0.15, 0.0, room.height - 0.06)
+                solid(self.soup, frame, (0, 0, 0.001), (0.5, 0.3, 0.05), bulb)
+                self._lights.append((float(x), float(y), room.height - 0.3, strength))
+
+
+# which several motions and hazards share
+interior_of = functools.lru_cache(maxsize=4)(Interior)

@@ -1,0 +1,84 @@
+"""The light that falls on the surfaces of a house: from its lamps and windows, and from surface to surface."""
+
+import functools
+
+import numpy as np
+
+from slam.runtime.imports import import_open3d
+from slam.simulation.geometry import Float32Array, FloatArray, IntArray
+from slam.simulation.interior import interior_of
+from slam.simulation.room_textures import GLOWING
+from slam.simulation.world import Surface
+
+_RAYS = 48  # around a corner
+_BOUNCES = 3
+_ALBEDO = 0.55
+_REACH_M = 9.0  # of a lamp
+
+
+@functools.lru_cache(maxsize=2)
+def irradiance_of(seed: int, some_are_dim: bool) -> Float32Array:
+    """Irradiance in a house, some rooms of which may be dim.
+
+    It is that at the corners of triangles, about 1 below a lamp, ``(3, T)``; they face the side that is seen.
+    """
+    interior = interior_of(seed)
+    lights = interior.lights.copy()
+    if some_are_dim:
+        strength = np.exp(
+            np.random.default_rng([seed, 54]).uniform(-1.5, 0.5, len(interior.house.rooms))
+        )
+        for room, factor in zip(interior.house.rooms, strength):
+            lights[room.contains(lights[:, :2]), 3] *= factor
+    surface, mesh = Surface(interior.mesh), interior.mesh
+    triangles = mesh.triangles.astype(np.int64)
+    count = len(mesh.vertices)
+    middle, normal = np.zeros((count, 3)), np.zeros((count, 3))
+    uses = np.bincount(triangles.ravel(), minlength=count)[:, None]
+    for corner in triangles.T:
+        np.add.at(middle, corner, mesh.vertices[triangles].mean(axis=1))
+        np.add.at(normal, corner, mesh.normals.T)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    middle /= np.maximum(uses, 1)
+    points = (
+        mesh.vertices + 0.12 * (middle - mesh.vertices) + 0.015 * normal
+    )  # out of the corner, off the surface
+    direct = np.zeros(len(points))  # the light of the lamps that are seen
+    for x, y, z, strength in lights:
+        towards = np.array([x, y, z]) - points
+        distance = np.linalg.norm(towards, axis=1)
+        cosine = (towards * normal).sum(axis=1) / np.maximum(distance, 1e-9)
+        near = np.flatnonzero((distance < _REACH_M) & (cosine > 0.0))
+        rays = np.hstack([points[near], towards[near]]).astype(np.float32)
+        blocked = surface.scene.test_occlusions(
+            import_open3d().core.Tensor(rays), 0.0, 0.97
+        ).numpy()
+        fade = strength * cosine[near] / (1.0 + 0.35 * distance[near] ** 2)
+        direct[near] += np.where(blocked, 0.0, fade)
+    hit = _around(surface, points, normal)
+    shining = np.isin(mesh.material, [int(material) for material in GLOWING])
+    total = direct
+    for _ in range(_BOUNCES):
+        thrown = np.where(shining, 1.2, _ALBEDO * total[triangles].mean(axis=1))
+        thrown = np.append(thrown, 0.0)  # for rays that meet nothing
+        total = direct + thrown[hit].mean(axis=0)
+    return np.ascontiguousarray(total[triangles].T, dtype=np.float32)
+
+
+def _around(surface: Surface, points: FloatArray, normals: FloatArray) -> IntArray:
+    """Triangles that cosine-weighted rays from points ``(V, 3)`` meet, ``(_RAYS, V)``; -1 where none."""
+    turn = np.arange(_RAYS) * 2.39996  # the golden angle
+    radius = np.sqrt((np.arange(_RAYS) + 0.5) / _RAYS)
+    helper = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    side = np.cross(normals, helper)
+    side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
+    other = np.cross(normals, side)
+    found = np.empty((_RAYS, len(points)), dtype=np.int64)
+    for k, (angle, r) in enumerate(zip(turn, radius)):
+        direction = (
+            r * np.cos(angle) * side + r * np.sin(angle) * other + np.sqrt(1.0 - r * r) * normals
+        )
+        answer = surface.cast(np.hstack([points, direction]).astype(np.float32))
+        met = np.isfinite(answer["t_hit"])
+        found[k] = np.where(met, answer["primitive_ids"].astype(np.int64), -1)
+    return found

@@ -1,11 +1,12 @@
-"""The pose graph: relative poses in, the most likely trajectory out; and that of maps without a common unit.
+"""The pose graph: relative poses in, the most likely trajectory out; also of maps of several units.
 
-GTSAM perturbs a pose on the right, ``T Exp(xi)``, rotation first; the sigmas of a ``RelativePose`` follow
-that order. A Huber kernel limits outliers: redescending ones do not recover from a drifted start.
+GTSAM perturbs a pose on the right, ``T Exp(xi)``, rotation first; the sigmas of a ``RelativePose``
+follow that order. A Huber kernel limits outliers: redescending ones do not recover from a drifted
+start.
 
-Poses and units of the cameras of several maps are those that agree best with measured similarities, as in Strasdat et
-al. 2010: scale drifts along a monocular map, and loops measure how far. GTSAM writes a similarity as
-``p -> s (R p + t)``.
+Poses and units of the cameras of several maps are those that agree best with measured similarities,
+as in Strasdat et al. 2010: scale drifts along a monocular map, and loops measure how far. GTSAM
+writes a similarity as ``p -> s (R p + t)``.
 """
 
 from __future__ import annotations
@@ -31,14 +32,12 @@ from slam.runtime.errors import SlamError
 from slam.runtime.files import write_atomically
 
 _ANCHOR_SIGMA = 1e-6
-_LOOSE_SIGMAS = np.repeat(
-    [0.3, 1e3], 3
-)  # of the first pose where positions hold the graph: radians, metres
-HUBER_K = (
-    1.345  # whitened residual at which the loss becomes linear: 95 % efficient for normal errors
-)
-# of a loop or position that is removed: whitened residual, and over the median of its kind
-_LARGEST_RESIDUAL, _OUTLYING = 8.0, 3.0
+# of the first pose where positions hold the graph: radians, metres
+_LOOSE_SIGMAS = np.repeat([0.3, 1e3], 3)
+# whitened residual at which the loss becomes linear: 95 % efficient for normal errors
+HUBER_K = 1.345
+_LARGEST_RESIDUAL = 8.0  # whitened, of a loop or position that is removed
+_OUTLYING = 3.0  # its residual over the median of its kind
 _MAX_ITERATIONS = 100  # of Levenberg-Marquardt
 _MAX_DROPPED_LOOPS = 10  # largest number of loops removed where the system is singular
 _RELATIVE_TOLERANCE = 1e-6  # relative decrease of the error below which it ends
@@ -51,12 +50,14 @@ logger = logging.getLogger(__name__)
 
 
 class PoseGraph:
-    """Camera poses as nodes 0 to N - 1 and relative poses as factors; node 0 is fixed as the world frame.
+    """Camera poses as nodes 0 to N - 1 and relative poses as factors; node 0 is the world frame.
 
     Attributes:
         relative_poses: the factors in use, in the order they were added.
-        dropped: loop factors dropped: the system was singular with them, or they contradict the rest.
-        T_fixed_world: ``(4, 4)``: the world in the axes of the measured positions; the identity without any.
+        dropped: loop factors that were left out: the system was singular with them, or they
+            contradict the rest.
+        T_fixed_world: ``(4, 4)``: the world in the axes of the measured positions; the identity
+            without any.
     """
 
     def __init__(self) -> None:
@@ -70,7 +71,8 @@ class PoseGraph:
         """Add measurements as factors.
 
         Raises:
-            SlamError: if one is not a rigid transform, links a frame to itself or has no positive sigmas.
+            SlamError: if one is not a rigid transform, links a frame to itself or to a negative
+                one, or lacks six positive sigmas. Then none of them is added.
         """
         for edge in relative_poses:
             name = f"factor {edge.from_index} -> {edge.to_index} ({edge.source})"
@@ -90,9 +92,13 @@ class PoseGraph:
         sigmas: FloatArray,
         T_fixed_world_initial: FloatArray,
     ) -> None:
-        """Add positions ``(M, 3)`` at ``frames`` ``(M,)``, metres, with ``sigmas`` ``(M, 3)`` along their axes.
+        """Add measured positions of cameras as factors.
 
-        The world lies about at ``T_fixed_world_initial`` ``(4, 4)`` in these axes.
+        Args:
+            frames: the nodes, ``(M,)``.
+            positions: in axes of their own, metres, ``(M, 3)``.
+            sigmas: along these axes, metres, ``(M, 3)``.
+            T_fixed_world_initial: where the world lies about in these axes, ``(4, 4)``.
         """
         self._positions += zip(frames.tolist(), positions, sigmas, strict=True)
         self.T_fixed_world = T_fixed_world_initial
@@ -107,7 +113,8 @@ class PoseGraph:
             ``T_world_camera`` ``(N, 4, 4)``.
 
         Raises:
-            SlamError: if frames are not connected or the system cannot be solved.
+            SlamError: if frames are not connected, a factor links a frame beyond the last, the start
+                is not rigid, or the system cannot be solved.
         """
         _check_connected(self.relative_poses, len(T_world_camera_initial))
         if not is_se3(T_world_camera_initial):
@@ -120,10 +127,8 @@ class PoseGraph:
                 return self._T_world_camera.copy()
             except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException among them
                 reason = str(error).strip().partition("\n")[0]
-                loops = [
-                    k for k, edge in enumerate(self.relative_poses) if edge.source == LOOP_SOURCE
-                ]
-                if not loops:
+                loops = np.flatnonzero(self._is_loop())
+                if not len(loops):
                     raise SlamError(f"the pose graph cannot be solved: {reason}") from error
                 newest = self.relative_poses.pop(loops[-1])
                 self.dropped.append(newest)
@@ -134,28 +139,28 @@ class PoseGraph:
         )
 
     def drop_contradicted(self) -> bool:
-        """Drop loops and positions with a large residual at the optimised trajectory while most have a small one.
+        """Drop loops and positions whose residual is large while that of most is small.
 
-        Where the odometry is overconfident all have large residuals. So one must also lie far above the median of its
-        kind.
+        Residuals are those at the optimised trajectory. Where the odometry is overconfident all have
+        large ones. So one must also lie far above the median of its kind.
 
         Returns:
             Whether one was dropped: optimise again.
+
+        Raises:
+            SlamError: if the graph was not optimised.
         """
         T_world_camera = self._solution()
-        is_wrong = np.array(
-            [edge.source == LOOP_SOURCE for edge in self.relative_poses], dtype=bool
-        )
+        is_wrong = self._is_loop()
         is_wrong[is_wrong] = _outlying(
             whitened_squared(compress(self.relative_poses, is_wrong), T_world_camera)
         )
         self.dropped += compress(self.relative_poses, is_wrong)
         self.relative_poses = list(compress(self.relative_poses, ~is_wrong))
         placed = (self.T_fixed_world @ T_world_camera)[:, :3, 3]
-        squared = [
-            float((((placed[k] - position) / own) ** 2).sum())
-            for k, position, own in self._positions
-        ]
+        squared = []
+        for frame, position, own in self._positions:
+            squared.append(float((((placed[frame] - position) / own) ** 2).sum()))
         is_stray = _outlying(np.array(squared))
         self._positions = list(compress(self._positions, ~is_stray))
         if is_stray.any():
@@ -165,10 +170,10 @@ class PoseGraph:
         return bool(is_wrong.any() or is_stray.any())
 
     def marginal(self, frame: int) -> FloatArray:
-        """Covariance ``(6, 6)`` of a frame's pose at the optimised trajectory, with the first frame fixed.
+        """Covariance ``(6, 6)`` of a frame's pose at the optimised trajectory, the first frame fixed.
 
-        It is of a perturbation in the camera, ``T_world_camera Exp(xi)``: rotation first, radians and the unit of the
-        factors.
+        It is of a perturbation in the camera, ``T_world_camera Exp(xi)``: rotation first, radians and
+        the unit of the factors.
 
         Raises:
             SlamError: there is no such frame, or the graph was not optimised.
@@ -182,20 +187,25 @@ class PoseGraph:
         return np.asarray(gtsam.Marginals(self._factors(values), values).marginalCovariance(frame))
 
     def write_g2o(self, path: Path) -> None:
-        """Write the optimised graph in g2o's text format at full precision, atomically."""
+        """Write the optimised graph in g2o's text format at full precision, atomically.
+
+        Raises:
+            SlamError: if the graph was not optimised.
+        """
+        lines = []
+        for k, pose in enumerate(translations_and_quaternions(self._solution())):
+            lines.append(f"{_VERTEX} {k} {_numbers(pose)}")
         T_from_to = np.array([edge.T_from_to for edge in self.relative_poses]).reshape(-1, 4, 4)
-        lines = [
-            f"{_VERTEX} {k} {_numbers(pose)}"
-            for k, pose in enumerate(translations_and_quaternions(self._solution()))
-        ]
-        for edge, pose in zip(
-            self.relative_poses, translations_and_quaternions(T_from_to), strict=True
-        ):
+        measured = translations_and_quaternions(T_from_to)
+        for edge, pose in zip(self.relative_poses, measured, strict=True):
+            ends = f"{edge.from_index} {edge.to_index}"
             information = np.diag(1.0 / edge.graph_sigmas[_TRANSLATION_FIRST] ** 2)[_UPPER]
-            lines.append(
-                f"{_EDGE} {edge.from_index} {edge.to_index} {_numbers(pose)} {_numbers(information)}"
-            )
+            lines.append(f"{_EDGE} {ends} {_numbers(pose)} {_numbers(information)}")
         write_atomically(path, "\n".join([*lines, ""]))
+
+    def _is_loop(self) -> NDArray[np.bool_]:
+        """Which of the factors ``(F,)`` are loops."""
+        return np.array([edge.source == LOOP_SOURCE for edge in self.relative_poses], dtype=bool)
 
     def _solution(self) -> FloatArray:
         if self._T_world_camera is None:
@@ -204,18 +214,18 @@ class PoseGraph:
 
     def _solve(self, T_world_camera_initial: FloatArray) -> FloatArray:
         values = self._values(T_world_camera_initial)
-        graph, parameters = self._factors(values), gtsam.LevenbergMarquardtParams()
+        graph = self._factors(values)
+        parameters = gtsam.LevenbergMarquardtParams()
         parameters.setMaxIterations(_MAX_ITERATIONS)
         parameters.setRelativeErrorTol(_RELATIVE_TOLERANCE)
         optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
         solved = optimiser.optimize()
-        errors = graph.error(values), optimiser.error()
-        count, iterations = len(self.relative_poses), optimiser.iterations()
         logger.info(
             "pose graph: %d factors, error %.4g to %.4g in %d iterations",
-            count,
-            *errors,
-            iterations,
+            len(self.relative_poses),
+            graph.error(values),
+            optimiser.error(),
+            optimiser.iterations(),
         )
         T_fixed_camera = np.stack(
             [solved.atPose3(k).matrix() for k in range(len(T_world_camera_initial))]
@@ -256,7 +266,10 @@ class PoseGraph:
 def whitened_squared(
     relative_poses: Iterable[RelativePose], T_world_camera: FloatArray
 ) -> FloatArray:
-    """Whitened squared 6-dof residual ``(F,)`` of each measurement at a trajectory ``(N, 4, 4)``."""
+    """Whitened squared 6-dof residual of each measurement at a trajectory ``(N, 4, 4)``, ``(F,)``.
+
+    It is by the sigmas of single measurements: their errors need not be independent.
+    """
     squared = []
     for edge in relative_poses:
         T_from_to = invert(T_world_camera[edge.from_index]) @ T_world_camera[edge.to_index]
@@ -266,7 +279,7 @@ def whitened_squared(
 
 
 def _outlying(squared: FloatArray) -> NDArray[np.bool_]:
-    """Which whitened squared residuals ``(F,)`` are large by themselves, and far above the median."""
+    """Which whitened squared residuals ``(F,)`` are large, and far above the median as well."""
     typical = float(np.median(np.sqrt(squared))) if len(squared) else 0.0
     return np.asarray(squared > max(_LARGEST_RESIDUAL, _OUTLYING * typical) ** 2)
 
@@ -279,9 +292,8 @@ def _check_connected(relative_poses: Sequence[RelativePose], count: int) -> None
     _, component = connected_components(links, directed=False)
     loose = np.flatnonzero(component != component[0])
     if len(loose):
-        raise SlamError(
-            f"{len(loose)} of {count} frames are not connected to the first, from frame {loose[0]} on"
-        )
+        loose_frames = f"{len(loose)} of {count} frames are not connected to the first"
+        raise SlamError(f"{loose_frames}, from frame {loose[0]} on")
 
 
 def robust_noise(sigmas: FloatArray) -> Any:
@@ -296,10 +308,10 @@ def _pose3(T_a_b: FloatArray) -> Any:
 
 @dataclass(frozen=True)
 class RelativeSimilarity:
-    """A measured similarity between two cameras whose units of length differ: ``p_from = scale R p_to + t``.
+    """A measured similarity between two cameras whose units differ: ``p_from = scale R p_to + t``.
 
-    ``T_from_to`` ``(4, 4)`` is in the unit of the first camera, as are the ``sigmas`` ``(7,)`` of rotation and
-    translation; the last sigma is that of the logarithm of the scale.
+    ``T_from_to`` ``(4, 4)`` is in the unit of the first camera, as are the ``sigmas`` ``(7,)`` of
+    rotation and translation; the last sigma is that of the logarithm of the scale.
     """
 
     from_index: int
@@ -339,9 +351,8 @@ def optimise_similarities(
     try:
         solved = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
     except RuntimeError as error:
-        raise SlamError(
-            f"the maps cannot be joined: {str(error).strip().partition(chr(10))[0]}"
-        ) from error
+        reason = str(error).strip().partition("\n")[0]
+        raise SlamError(f"the maps cannot be joined: {reason}") from error
     found = [solved.atSimilarity3(k) for k in range(len(T_world_camera))]
     R = Rotation.from_matrix([each.rotation().matrix() for each in found]).as_matrix()
     scales = np.array([each.scale() for each in found])

@@ -1,3 +1,7 @@
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
 import gtsam
 import numpy as np
 import pytest
@@ -5,6 +9,7 @@ import pytest
 from slam.frames import RelativePose
 from slam.geometry import se3
 from slam.graph.pose_graph import LOOP_SOURCE, PoseGraph, whitened_squared
+from slam.runtime.errors import SlamError
 
 ROTATION, TRANSLATION = 0.003, 0.03
 
@@ -100,6 +105,59 @@ def test_world_stays_at_the_first_pose():
     np.testing.assert_allclose(solved, moved, atol=1e-5)
 
 
+def test_correlated_sigmas_weigh_a_chain_against_a_loop_and_leave_sigmas_as_they_are():
+    """The graph weighs by ``correlated_sigmas``; single residuals are whitened by ``sigmas``."""
+    truth, odometry, _, loops, initial = noisy_problem()
+    chained = [replace(each, correlated_sigmas=4.0 * each.sigmas) for each in odometry]
+    looser = [replace(each, sigmas=4.0 * each.sigmas) for each in odometry]
+    _, solved = solve(chained + loops, initial)
+    _, solved_looser = solve(looser + loops, initial)
+    _, stiff = solve(odometry + loops, initial)
+    np.testing.assert_array_equal(solved, solved_looser)
+    assert np.abs(solved - stiff).max() > 1e-3
+    of_chained = whitened_squared(chained, truth)
+    np.testing.assert_array_equal(of_chained, whitened_squared(odometry, truth))
+
+
+def test_wrong_input_is_refused_with_its_name(tmp_path: Path) -> None:
+    truth = circle(5)
+    good = edge(truth, 0, 1)
+    graph = PoseGraph()
+    with pytest.raises(SlamError, match="not been optimised"):
+        graph.write_g2o(tmp_path / "graph.g2o")
+    with pytest.raises(SlamError, match="not been optimised"):
+        graph.marginal(0)
+    undefined = good.T_from_to.copy()
+    undefined[0, 0] = np.nan
+    rigid, sigmas = "is not a finite rigid transform", "needs six positive sigmas; got"
+    wrong = [
+        ("must link two different frames", replace(good, to_index=0)),
+        (rigid, replace(good, T_from_to=undefined)),
+        (rigid, replace(good, T_from_to=2.0 * np.eye(4))),
+        (sigmas, replace(good, sigmas=np.zeros(6))),
+        (sigmas, replace(good, sigmas=np.ones(3))),
+        (sigmas, replace(good, correlated_sigmas=np.full(6, np.inf))),
+    ]
+    for said, factor in wrong:
+        name = rf"^factor 0 -> {factor.to_index} \(network\) {said}"
+        with pytest.raises(SlamError, match=name):
+            graph.add_relative(good, factor)
+    with pytest.raises(SlamError, match="factor -1 -> 1"):
+        graph.add_relative(replace(good, from_index=-1))
+    assert graph.relative_poses == []
+    graph.add_relative(good, edge(truth, 1, 2), edge(truth, 3, 4))
+    with pytest.raises(SlamError, match=r"^2 of 5 frames are not connected.*frame 3"):
+        graph.optimise(truth)
+    with pytest.raises(SlamError, match=r"frame 4.*3 frames"):
+        graph.optimise(truth[:3])
+    graph.add_relative(edge(truth, 2, 3))
+    with pytest.raises(SlamError, match="initial trajectory"):
+        graph.optimise(2.0 * truth)
+    graph.optimise(truth)
+    with pytest.raises(SlamError, match=r"no frame 5 .* 0 to 4"):
+        graph.marginal(5)
+
+
 def test_whitened_residual_by_hand():
     sigmas = np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])
     measured = RelativePose(0, 1, np.eye(4), sigmas, "network")
@@ -133,6 +191,34 @@ def test_g2o_round_trip_through_gtsam(tmp_path):
         np.testing.assert_allclose(factor.measured().matrix(), e.T_from_to, atol=1e-12)
         np.testing.assert_allclose(factor.noiseModel().sigmas(), sigmas, rtol=1e-9)
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_newest_loops_are_dropped_when_the_system_is_singular(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    _, odometry, _, loops, initial = noisy_problem(count=40)
+    optimiser = gtsam.LevenbergMarquardtOptimizer
+    most = len(odometry) + 2  # the factor that fixes the first pose, and one loop
+
+    def singular_above(graph: Any, *others: Any) -> Any:
+        if graph.size() > most:
+            raise RuntimeError("\nIndeterminant linear system detected\nlong explanation")
+        return optimiser(graph, *others)
+
+    monkeypatch.setattr(gtsam, "LevenbergMarquardtOptimizer", singular_above)
+    graph, solved = solve(odometry[:10] + loops[:3] + odometry[10:], initial)
+    assert graph.dropped == [loops[2], loops[1]]
+    assert graph.relative_poses == odometry[:10] + loops[:1] + odometry[10:]
+    np.testing.assert_array_equal(
+        solved, solve(odometry[:10] + loops[:1] + odometry[10:], initial)[1]
+    )
+    most = 0
+    with pytest.raises(SlamError, match=r"^the pose graph cannot be solved: Ind.* detected$"):
+        graph.optimise(initial)
+    assert graph.dropped == [loops[2], loops[1], loops[0]] and graph.relative_poses == odometry
+    many = [replace(loops[0], T_from_to=loops[0].T_from_to.copy()) for _ in range(12)]
+    with pytest.raises(SlamError, match="even without 11 loop edges"):
+        solve(odometry + many, initial)
 
 
 def test_a_loop_contradicted_by_the_rest_is_dropped():

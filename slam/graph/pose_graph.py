@@ -113,8 +113,8 @@ class PoseGraph:
             ``T_world_camera`` ``(N, 4, 4)``.
 
         Raises:
-            SlamError: if frames are not connected, a factor links a frame beyond the last, the start
-                is not rigid, or the system cannot be solved.
+            SlamError: if frames are not connected, a factor links a frame beyond the last, the
+                start is not rigid, or the system cannot be solved.
         """
         _check_connected(self.relative_poses, len(T_world_camera_initial))
         if not is_se3(T_world_camera_initial):
@@ -141,8 +141,8 @@ class PoseGraph:
     def drop_contradicted(self) -> bool:
         """Drop loops and positions whose residual is large while that of most is small.
 
-        Residuals are those at the optimised trajectory. Where the odometry is overconfident all have
-        large ones. So one must also lie far above the median of its kind.
+        Residuals are those at the optimised trajectory. Where the odometry is overconfident all
+        have large ones. So one must also lie far above the median of its kind.
 
         Returns:
             Whether one was dropped: optimise again.
@@ -170,10 +170,10 @@ class PoseGraph:
         return bool(is_wrong.any() or is_stray.any())
 
     def marginal(self, frame: int) -> FloatArray:
-        """Covariance ``(6, 6)`` of a frame's pose at the optimised trajectory, the first frame fixed.
+        """Covariance ``(6, 6)`` of a frame's pose at the optimised trajectory.
 
-        It is of a perturbation in the camera, ``T_world_camera Exp(xi)``: rotation first, radians and
-        the unit of the factors.
+        The first frame is fixed. It is of a perturbation in the camera, ``T_world_camera Exp(xi)``:
+        rotation first, radians and the unit of the factors.
 
         Raises:
             SlamError: there is no such frame, or the graph was not optimised.

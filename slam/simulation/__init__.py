@@ -1,1 +1,1 @@
-"""The simulated street world: plan, surfaces, textures, traffic, LiDAR, and the sequence rendered from it."""
+"""Simulated worlds, a street and a house: surfaces, textures, and what a camera sees of them."""

@@ -1,4 +1,7 @@
-"""The motion of a camera that is carried: legs between places, turns, sweeps and rests, with its carrier's unrest."""
+"""The motion of a camera that is carried: legs between places, turns, sweeps and rests.
+
+The unrest of its carrier is on top of all of them.
+"""
 
 from dataclasses import dataclass
 from typing import get_args
@@ -47,11 +50,20 @@ assert tuple(GAITS) == get_args(Motion)
 class Carried:
     """A motion, ``CLOCK`` samples a second.
 
-    Its channels ``(M, 6)`` are x, y, z in metres, yaw to the left from east, pitch upwards and roll in radians.
+    Its channels ``(M, 6)`` are x, y, z in metres, yaw to the left from east, pitch upwards and roll
+    in radians.
     """
 
     def __init__(self, floor: Floor, motion: str, seconds: float, rate: float, seed: int) -> None:
-        """A motion of so many seconds for a camera of ``rate`` frames a second."""
+        """Draw a motion.
+
+        Args:
+            floor: where the carrier may go.
+            motion: one of `GAITS`.
+            seconds: how long it lasts at least.
+            rate: frames a second of the camera, which limits how fast it turns.
+            seed: of the world.
+        """
         rng, gait = np.random.default_rng([seed, 53, *motion.encode()]), GAITS[motion]
         turn = np.deg2rad(min(gait.turn_deg, 0.9 * FASTEST_TURN_DEG * rate))
         base, moved = _Walk(floor, gait, turn, rng).over(int(np.ceil(seconds * CLOCK)) + 2)
@@ -121,7 +133,10 @@ class _Walk:
     """Strings legs and rests together: x, y, yaw and pitch at every tick, and whether one walks."""
 
     def __init__(self, floor: Floor, gait: Gait, turn: float, rng: np.random.Generator) -> None:
-        self._floor, self._gait, self._turn, self._rng = floor, gait, turn, rng
+        self._floor = floor
+        self._gait = gait
+        self._turn = turn
+        self._rng = rng
         self._visits = np.zeros(int(floor.room.max()) + 1)
         self._place = int(rng.integers(len(floor.places)))
         self._yaw = float(rng.uniform(-np.pi, np.pi))

@@ -47,10 +47,8 @@ class Floor:
         )
         self._cells = np.argwhere(self._clearance >= _CLEAR_M)[:, ::-1]  # (C, 2), column and row
         self._graph = self._connect()
-        rng, (_, part) = (
-            np.random.default_rng([seed, 52]),
-            connected_components(self._graph, directed=False),
-        )
+        rng = np.random.default_rng([seed, 52])
+        _, part = connected_components(self._graph, directed=False)
         centres = self._centres(self._cells)
         roomy = (part == np.bincount(part).argmax()) & (self.clearance(centres) >= _PLACE_CLEAR_M)
         chosen: list[int] = []
@@ -60,7 +58,9 @@ class Floor:
             found = rng.choice(inside, min(len(inside), 5), replace=False)
             chosen.extend(found)
             rooms.extend([number] * len(found))
-        self.places, self.room, self._at = centres[chosen], np.array(rooms), np.array(chosen)
+        self.places = centres[chosen]
+        self.room = np.array(rooms)
+        self._at = np.array(chosen)
 
     def clearance(self, points: FloatArray) -> FloatArray:
         """Distance in plan from points ``(M, 2)`` to what stands there, metres, ``(M,)``."""

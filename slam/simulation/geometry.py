@@ -1,4 +1,4 @@
-"""Triangle meshes with materials: every surface is a grid of quads, bent onto the terrain or moved as a whole."""
+"""Triangle meshes with materials: grids of quads, bent onto the terrain or moved as a whole."""
 
 import dataclasses
 import functools
@@ -13,13 +13,14 @@ FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.int64]
 
-PARAMETERS = 6
-
+PARAMETERS = 6  # of a texture
+# fields of a mesh whose last axis is that of its triangles
+_OF_TRIANGLES = ("uv", "normals", "tangents", "instance", "material")
 
 Material = IntEnum(  # of a surface; selects its texture
     "Material",
-    "ASPHALT JUNCTION PAVEMENT KERB GRASS GRAVEL WALL ROOF BARK LEAVES METAL SIGN PAINT GLASS TYRE FENCE "
-    "PLASTER TILES BOARDS CARPET WOOD FABRIC BOOKS PICTURE SCREEN PANE CARTON LAMP",
+    "ASPHALT JUNCTION PAVEMENT KERB GRASS GRAVEL WALL ROOF BARK LEAVES METAL SIGN PAINT GLASS "
+    "TYRE FENCE PLASTER TILES BOARDS CARPET WOOD FABRIC BOOKS PICTURE SCREEN PANE CARTON LAMP",
     start=0,
 )
 
@@ -28,7 +29,8 @@ Material = IntEnum(  # of a surface; selects its texture
 class Mesh:
     """A finished mesh in the street frame (x east, y north, z up, metres).
 
-    Triangles and instances are the last axis of the lookup tables, for which gathering is several times faster.
+    Triangles and instances are the last axis of the lookup tables, for which gathering is several
+    times faster.
     """
 
     vertices: Float32Array  # (V, 3)
@@ -41,9 +43,6 @@ class Mesh:
     colours: Float32Array  # two base colours per instance, RGB in [0, 1], (2, 3, I)
     parameters: Float32Array  # of the material's texture, (PARAMETERS, I)
     offsets: Float32Array  # of an instance in the noise texture, (2, I)
-
-
-_OF_TRIANGLES = ("uv", "normals", "tangents", "instance", "material")
 
 
 @functools.lru_cache(maxsize=256)
@@ -63,9 +62,8 @@ class Soup:
         self._rng = rng
         # vertices, triangles, their texture coordinates and instances, patch by patch
         self._patches: list[tuple[FloatArray, IntArray, FloatArray, IntArray]] = []
-        self._looks: list[
-            tuple[int, FloatArray, FloatArray]
-        ] = []  # material, colours and parameters, by instance
+        # material, colours and parameters, by instance
+        self._looks: list[tuple[int, FloatArray, FloatArray]] = []
         self._count = 0  # of vertices
 
     @property
@@ -89,7 +87,13 @@ class Soup:
         return len(self._looks) - 1
 
     def patch(self, points: FloatArray, uv: FloatArray, instance: int) -> None:
-        """Add a grid of quads: vertices in the plan ``(R, C, 3)`` and texture coordinates in metres ``(R, C, 2)``."""
+        """Add a grid of quads.
+
+        Args:
+            points: its vertices in the plan, ``(R, C, 3)``.
+            uv: texture coordinates of the vertices, metres, ``(R, C, 2)``.
+            instance: its look, a number from `instance`.
+        """
         triangles = _patch_triangles(points.shape[0], points.shape[1])
         of_triangles = (
             triangles + self._count,
@@ -151,9 +155,8 @@ class Bend:
     amplitudes: FloatArray  # of the sway in x and in y and of the hills, metres, (3,)
     wavelengths: FloatArray  # of the same, metres, (3,)
     phases: FloatArray  # of the same, radians, (3, 2)
-    road: FloatArray | None = (
-        None  # x, y and heading of a lone road every metre from road_start on, (M, 3)
-    )
+    # x, y and heading of a lone road every metre from road_start on, (M, 3)
+    road: FloatArray | None = None
     road_start: float = 0.0  # plan x of its first row
 
     def __call__(self, points: FloatArray) -> FloatArray:
@@ -180,23 +183,25 @@ FLAT = Bend(np.zeros(3), np.ones(3), np.zeros((3, 2)))  # the plan as it is
 
 
 def town_bend(rng: np.random.Generator, hills: tuple[float, float] | None = None) -> Bend:
-    """Streets that sway by a few degrees over gentle hills, or over some of a steepness and a wavelength in metres."""
+    """Streets that sway by a few degrees over hills.
+
+    The hills are gentle, or of a steepness (rise over run) and a wavelength in metres.
+    """
     wavelengths = rng.uniform([120.0, 120.0, 140.0], [220.0, 220.0, 220.0])
     amplitudes = np.array([*rng.uniform(0.5, 2.2, 2), rng.uniform(0.1, 0.45)])
     phases = rng.uniform(0.0, 2.0 * np.pi, (3, 2))
     if hills is not None:
         wavelengths[2] = hills[1]
         amplitudes[2] = hills[0] * hills[1] / (2.0 * np.pi)
-        phases[2, 1] = rng.uniform(
-            -0.35, 0.35
-        )  # across the road at y = 0 it is at most a third as steep as along it
+        # across the road at y = 0 it is at most a third as steep as along it
+        phases[2, 1] = rng.uniform(-0.35, 0.35)
     return Bend(amplitudes, wavelengths, phases)
 
 
 def road_bend(
     rng: np.random.Generator, start: float, end: float, hills: tuple[float, float] | None = None
 ) -> Bend:
-    """A road whose heading wanders within about 35 degrees, radius of curvature at least about 80 m."""
+    """A road whose heading wanders within about 35 degrees, at a radius of about 80 m or more."""
     town = town_bend(rng, hills)
     s = np.arange(np.floor(start), np.ceil(end) + 2.0)
     heading = np.zeros_like(s)
@@ -242,10 +247,9 @@ class Moving:
         ]
         corners = np.concatenate([part.vertices for part in parts])
         corners_of = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
-        tables = {
-            name: np.concatenate([getattr(part, name) for part in parts], axis=-1)
-            for name in _OF_TRIANGLES
-        }
+        tables = {}
+        for name in _OF_TRIANGLES:
+            tables[name] = np.concatenate([getattr(part, name) for part in parts], axis=-1)
         return [dataclasses.replace(self._mesh, vertices=corners, triangles=corners_of, **tables)]
 
     def _part(self, number: int, T_scene_thing: FloatArray) -> Mesh:

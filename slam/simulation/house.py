@@ -1,4 +1,4 @@
-"""The plan of a house: rooms on both sides of a corridor, a hall at its end, and the doors between them."""
+"""The plan of a house: rooms on both sides of a corridor, a hall at its end, and the doors."""
 
 from dataclasses import dataclass
 

@@ -80,11 +80,9 @@ class Interior:
     def _doorway(self, door: Rectangle) -> None:
         """Jambs, lintel and threshold of an opening."""
         x0, y0, x1, y1 = door
-        east, north, up = (
-            np.array([x1 - x0, 0, 0]),
-            np.array([0, y1 - y0, 0]),
-            np.array([0, 0, DOOR_HEIGHT]),
-        )
+        east = np.array([x1 - x0, 0, 0])
+        north = np.array([0, y1 - y0, 0])
+        up = np.array([0, 0, DOOR_HEIGHT])
         corner = np.array([x0, y0, 0.0])
         if x1 - x0 > WALL + 0.01:
             jambs = (corner, north), (corner + east + north, -north)
@@ -95,7 +93,7 @@ class Interior:
             self.soup.quad(*quad, self.frame_look)
 
     def _panel(self, corner: FloatArray, along: FloatArray, up: FloatArray, look: int) -> None:
-        """A parallelogram with vertices at most ``_STEP`` apart, textured in metres from its corner."""
+        """A parallelogram, vertices at most ``_STEP`` apart, textured in metres from its corner."""
         width, height = float(np.linalg.norm(along)), float(np.linalg.norm(up))
         a, b = (
             np.linspace(0.0, 1.0, int(np.ceil(extent / _STEP)) + 1) for extent in (width, height)
@@ -105,7 +103,7 @@ class Interior:
         self.soup.patch(points, np.stack([u, v], axis=2), look)
 
     def _furnish(self, room: Room, number: int, wall: int) -> None:
-        """One wall around its doors, seen from inside; furniture along it, pictures above that and windows."""
+        """One wall around its doors, seen from inside, with windows, furniture and pictures."""
         rng, openings = self.rng, self.house.openings(room, number)
         (x, y), angle, length = room.side(number)
         ahead, up = np.array([np.cos(angle), np.sin(angle), 0.0]), np.array([0.0, 0.0, 1.0])
@@ -225,7 +223,7 @@ class Interior:
         rng, (x0, y0, x1, y1) = self.rng, room.area
         bulb = self.soup.instance(Material.LAMP, np.array([1.0, 0.98, 0.92]))
         strength = (0.8 if room.kind == "hall" else 1.0) * float(rng.uniform(0.8, 1.2))
-        across, along = (max(1, round((extent) / 3.4)) for extent in (x1 - x0, y1 - y0))
+        across, along = (max(1, round(extent / 3.4)) for extent in (x1 - x0, y1 - y0))
         for x in x0 + (np.arange(across) + 0.5) / across * (x1 - x0):
             for y in y0 + (np.arange(along) + 0.5) / along * (y1 - y0):
                 frame = frame_at(x - 0.25, y - 0.15, 0.0, room.height - 0.06)

@@ -1,4 +1,4 @@
-"""The light that falls on the surfaces of a house: from its lamps and windows, and from surface to surface."""
+"""The light on the surfaces of a house: from its lamps and windows, and from other surfaces."""
 
 import functools
 
@@ -20,7 +20,8 @@ _REACH_M = 9.0  # of a lamp
 def irradiance_of(seed: int, some_are_dim: bool) -> Float32Array:
     """Irradiance in a house, some rooms of which may be dim.
 
-    It is that at the corners of triangles, about 1 below a lamp, ``(3, T)``; they face the side that is seen.
+    It is that at the corners of triangles, about 1 below a lamp, ``(3, T)``; they face the side
+    that is seen.
     """
     interior = interior_of(seed)
     lights = interior.lights.copy()
@@ -40,9 +41,8 @@ def irradiance_of(seed: int, some_are_dim: bool) -> Float32Array:
         np.add.at(normal, corner, mesh.normals.T)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     middle /= np.maximum(uses, 1)
-    points = (
-        mesh.vertices + 0.12 * (middle - mesh.vertices) + 0.015 * normal
-    )  # out of the corner, off the surface
+    # out of the corner, off the surface
+    points = mesh.vertices + 0.12 * (middle - mesh.vertices) + 0.015 * normal
     direct = np.zeros(len(points))  # the light of the lamps that are seen
     for x, y, z, strength in lights:
         towards = np.array([x, y, z]) - points
@@ -66,7 +66,10 @@ def irradiance_of(seed: int, some_are_dim: bool) -> Float32Array:
 
 
 def _around(surface: Surface, points: FloatArray, normals: FloatArray) -> IntArray:
-    """Triangles that cosine-weighted rays from points ``(V, 3)`` meet, ``(_RAYS, V)``; -1 where none."""
+    """Triangles that cosine-weighted rays from points ``(V, 3)`` meet, ``(_RAYS, V)``.
+
+    It is -1 where a ray meets none.
+    """
     turn = np.arange(_RAYS) * 2.39996  # the golden angle
     radius = np.sqrt((np.arange(_RAYS) + 0.5) / _RAYS)
     helper = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])

@@ -22,7 +22,11 @@ from slam.simulation.world import SimulatedWorld
 
 
 def simulated_world(options: SimulationOptions) -> SimulatedWorld:
-    """The street or the rooms of these options; ``SequenceError`` where there are too few frames for the route."""
+    """The street or the rooms of these options.
+
+    Raises:
+        SequenceError: if there are too few frames for the route.
+    """
     return SimulatedRooms(options) if options.route == "rooms" else SimulatedStreet(options)
 
 
@@ -42,16 +46,19 @@ def write_kitti_root(
         depth: whether to write depth maps (16 bit, metres x 256, 0 where nothing was hit).
         lidar: whether to write scans.
         progress: called with the number of frames written so far.
-        mesh: whether to write all surfaces that stand still, as ``mesh.ply`` in the frame of the first camera.
+        mesh: whether to write all surfaces that stand still, as ``mesh.ply`` in the frame of the
+            first camera.
 
     Raises:
-        SequenceError: if ``output`` holds something already, or cannot be written; scans of a world without a LiDAR.
+        SequenceError: if ``output`` holds something already, or cannot be written; scans of a
+            world without a LiDAR.
     """
     if lidar and world.T_camera_lidar is None:
         raise SequenceError(f"no LiDAR is carried through {world.options.route}: leave --lidar out")
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise SequenceError(
-            f"{output} is {'not empty' if output.is_dir() else 'a file'}; remove it or choose another"
+            f"{output} is {'not empty' if output.is_dir() else 'a file'};"
+            " remove it or choose another"
         )
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
@@ -99,7 +106,9 @@ def _write_frames(
 
 def _write_records(world: SimulatedWorld, root: Path) -> None:
     """Calibration, times, poses, the camera and what was simulated."""
-    sequence, camera, options = root / "sequences" / "sim", world.camera, world.options
+    sequence = root / "sequences" / "sim"
+    camera = world.camera
+    options = world.options
     projection = _row(
         np.column_stack([camera.K, np.zeros(3)])
     )  # the one camera stands for all four

@@ -1,4 +1,4 @@
-"""Objects of a street: buildings, trees, cars, poles, signs, hedges, fences, railings and people."""
+"""Objects of a street: buildings, trees, hedges, fences, lamps, signs, cars and people."""
 
 from itertools import pairwise
 
@@ -15,8 +15,8 @@ def building(
     floor, floors = float(rng.uniform(2.7, 3.4)), int(rng.integers(1, 5))
     height = floors * floor + float(rng.uniform(0.4, 0.9))
     plaster = colour(
-        rng, (0.72, 0.66, 0.55), (0.62, 0.36, 0.27), (0.82, 0.80, 0.76), (0.66, 0.58, 0.42), (0.52, 0.52, 0.54),
-        (0.75, 0.55, 0.42), (0.55, 0.60, 0.62), (0.48, 0.30, 0.25),
+        rng, (0.72, 0.66, 0.55), (0.62, 0.36, 0.27), (0.82, 0.80, 0.76), (0.66, 0.58, 0.42),
+        (0.52, 0.52, 0.54), (0.75, 0.55, 0.42), (0.55, 0.60, 0.62), (0.48, 0.30, 0.25),
     )  # fmt: skip
     window_width = float(rng.uniform(0.8, 1.6))
     spacing = window_width + float(rng.uniform(0.6, 1.9))
@@ -117,10 +117,8 @@ def hedge(soup: Soup, rng: np.random.Generator, frame: FloatArray, length: float
         look, thick = soup.instance(Material.FENCE, wood, 0.35 * wood, (gap, height)), 0.06
     else:
         stone = colour(rng, (0.58, 0.55, 0.50), (0.52, 0.38, 0.30))
-        look, thick = (
-            soup.instance(Material.WALL, stone, stone, (99.0, 99.0, 0.0, 0.0, 1.0, height)),
-            0.3,
-        )
+        look = soup.instance(Material.WALL, stone, stone, (99.0, 99.0, 0.0, 0.0, 1.0, height))
+        thick = 0.3
     box(soup, frame, np.zeros(3), np.array([length, thick, height]), look)
 
 
@@ -228,10 +226,8 @@ def person(soup: Soup, rng: np.random.Generator, x: float, y: float) -> None:
         Material.METAL, colour(rng, (0.75, 0.58, 0.47), (0.45, 0.32, 0.25), spread=0.03)
     )
     size = float(rng.uniform(0.85, 1.08))
-    foot, side = (
-        np.array([x, y, 0.1]),
-        0.12 * np.array([*np.sin(rng.uniform(0, 7) + np.array([0, np.pi / 2])), 0.0]),
-    )
+    foot = np.array([x, y, 0.1])
+    side = 0.12 * np.array([*np.sin(rng.uniform(0, 7) + np.array([0, np.pi / 2])), 0.0])
     for leg in (foot + side, foot - side):
         tube(soup, leg, foot + 0.5 * (leg - foot) + 0.85 * size * UP, (0.08, 0.11), trousers)
     tube(soup, foot + 0.8 * size * UP, foot + 1.45 * size * UP, (0.17, 0.21), coat)
@@ -239,7 +235,10 @@ def person(soup: Soup, rng: np.random.Generator, x: float, y: float) -> None:
 
 
 def bonnet(soup: Soup, rng: np.random.Generator, below: float, height_m: float) -> None:
-    """The bonnet before a camera, in its frame; its far edge is seen at the slope ``below`` the axis."""
+    """The bonnet before a camera, in its frame.
+
+    Its far edge is seen at the slope ``below`` the axis.
+    """
     far = float(min(rng.uniform(1.1, 2.0), 0.6 * height_m / max(below, 0.05)))
     x, z = np.meshgrid(np.linspace(-1.1, 1.1, 15), np.linspace(0.25, far, 8))
     y = (
@@ -263,23 +262,19 @@ def bonnet(soup: Soup, rng: np.random.Generator, below: float, height_m: float) 
 def car(soup: Soup, rng: np.random.Generator, frame: FloatArray) -> None:
     """A car centred on the frame's origin and pointing along its x axis: body, cabin and wheels."""
     lacquer = colour(
-        rng, (0.75, 0.76, 0.78), (0.10, 0.10, 0.11), (0.45, 0.46, 0.48), (0.55, 0.08, 0.08), (0.10, 0.18, 0.42),
-        (0.85, 0.85, 0.84), (0.20, 0.32, 0.22), (0.70, 0.55, 0.15),
+        rng, (0.75, 0.76, 0.78), (0.10, 0.10, 0.11), (0.45, 0.46, 0.48), (0.55, 0.08, 0.08),
+        (0.10, 0.18, 0.42), (0.85, 0.85, 0.84), (0.20, 0.32, 0.22), (0.70, 0.55, 0.15),
     )  # fmt: skip
     paint = soup.instance(Material.PAINT, lacquer, 0.4 * lacquer, (1.0,))
     glass = soup.instance(Material.GLASS, np.array([0.10, 0.12, 0.14]), 0.8 * lacquer, (1.0,))
     tyre = soup.instance(
         Material.TYRE, np.array([0.05, 0.05, 0.05]), np.array([0.5, 0.5, 0.5]), (0.32,)
     )
-    length, half, van = (
-        float(rng.uniform(3.7, 4.7)),
-        float(rng.uniform(0.82, 0.92)),
-        rng.random() < 0.2,
-    )
-    waist, roof = (
-        float(rng.uniform(0.82, 0.98)),
-        float(rng.uniform(1.38, 1.6)) + (0.45 if van else 0.0),
-    )
+    length = float(rng.uniform(3.7, 4.7))
+    half = float(rng.uniform(0.82, 0.92))
+    van = rng.random() < 0.2
+    waist = float(rng.uniform(0.82, 0.98))
+    roof = float(rng.uniform(1.38, 1.6)) + (0.45 if van else 0.0)
     box(
         soup,
         frame,

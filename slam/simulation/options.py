@@ -23,10 +23,11 @@ WORLD_KINDS: tuple[str, ...] = (*get_args(RouteKind), "rooms")
 class SimulationOptions:
     """The street or the rooms to simulate; ``seed`` determines everything else.
 
-    A ``varied`` street is a town's, an avenue, a country road or a motorway (`Variety`) with another
-    camera than KITTI's, hills, hard light, railings and people, and cars that overtake if any move; ``varied`` rooms
-    have another focal length. ``rate``, frames a second, and ``motion`` are of rooms.
-    ``fov_deg`` is the horizontal field of view of square pixels; None is that of the world's own camera.
+    A ``varied`` street is a town's, an avenue, a country road or a motorway (``variety.py``) with
+    another camera than KITTI's, hills, hard light, railings and people, and cars that overtake if
+    any move; ``varied`` rooms have another focal length. ``rate``, frames a second, and ``motion``
+    are of rooms. ``fov_deg`` is the horizontal field of view of square pixels; None is that of the
+    world's own camera.
     """
 
     route: str = "loop"
@@ -41,7 +42,11 @@ class SimulationOptions:
     fov_deg: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse invalid options by a ``SequenceError`` that names one."""
+        """Refuse invalid options.
+
+        Raises:
+            SequenceError: names the first option that is invalid, and what it may be.
+        """
         if self.route not in WORLD_KINDS:
             raise SequenceError(
                 f"route must be one of {', '.join(WORLD_KINDS)}; got {self.route!r}"
@@ -56,7 +61,8 @@ class SimulationOptions:
                 raise SequenceError(f"hazards of {place} are {', '.join(known)}; got {hazard!r}")
         if self.route != "rooms" and (self.motion is not None or self.rate != STREET_RATE):
             raise SequenceError(
-                f"a street is driven at {STREET_RATE:g} frames a second: motion and rate are of rooms"
+                f"a street is driven at {STREET_RATE:g} frames a second:"
+                " motion and rate are of rooms"
             )
         if self.motion not in (None, *get_args(Motion)):
             raise SequenceError(
@@ -72,7 +78,8 @@ class SimulationOptions:
             raise SequenceError(f"a drive has {MOST_FRAMES:,} frames at most; got {self.frames:,}")
         if min(self.width, self.height) < 8 or self.width * self.height > _MOST_PIXELS:
             raise SequenceError(
-                f"images must be 8 x 8 or larger, of {_MOST_PIXELS:,} pixels at most; got {self.width} x {self.height}"
+                f"images must be 8 x 8 or larger, of {_MOST_PIXELS:,} pixels at most;"
+                f" got {self.width} x {self.height}"
             )
 
     @property

@@ -30,7 +30,11 @@ def frame_along(rectangle: Rectangle, number: int, z: float) -> FloatArray:
 
 
 def directed(start: FloatArray, end: FloatArray) -> tuple[float, FloatArray, FloatArray, float]:
-    """Length of an edge in the plan, its direction ``(2,)``, the one to its left, and its angle from east."""
+    """How an edge in the plan runs.
+
+    Returns:
+        Its length, its direction ``(2,)``, the one to its left and its angle from east.
+    """
     length = float(np.linalg.norm(end - start))
     ahead = (end - start) / max(length, 1e-9)
     return length, ahead, np.array([-ahead[1], ahead[0]]), float(np.arctan2(ahead[1], ahead[0]))

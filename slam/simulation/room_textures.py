@@ -1,4 +1,4 @@
-"""Procedural textures of what is inside a house: its walls and floors, furniture, pictures and lamps."""
+"""Procedural textures of what is inside a house: walls, floors, furniture, pictures and lamps."""
 
 import numpy as np
 
@@ -115,10 +115,8 @@ def _picture(texels: Texels, colours: Float32Array, parameters: Float32Array) ->
     """A painting of blots, or a poster of a picture and text, in a frame."""
     width, height, kind = parameters[:3]
     blot = fractal(texels, (0.31, 0.27, 1.0), (0.12, 0.11, 0.7), (0.05, 0.05, 0.4))
-    first, second = (
-        np.clip(9.0 * blot + 0.5, 0.0, 1.0),
-        np.clip(9.0 * np.abs(blot - 0.3) - 1.2, 0.0, 1.0),
-    )
+    first = np.clip(9.0 * blot + 0.5, 0.0, 1.0)
+    second = np.clip(9.0 * np.abs(blot - 0.3) - 1.2, 0.0, 1.0)
     third = np.stack([colours[1][2], colours[0][0], colours[1][0]])
     rgb = mix(mix(third, colours[0], second), colours[1], first)
     line = 0.03 + 0.02 * (kind - 1.0)

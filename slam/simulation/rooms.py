@@ -43,7 +43,11 @@ class SimulatedRooms(SimulatedWorld):
     """A house and a walk through it; the attributes are those of `SimulatedWorld`."""
 
     def __init__(self, options: SimulationOptions) -> None:
-        """Plan the house and the walk; ``SequenceError`` where there are too few frames."""
+        """Plan the house and the walk.
+
+        Raises:
+            SequenceError: if there are fewer than two frames.
+        """
         if options.frames < 2:
             raise SequenceError(f"a walk needs at least 2 frames; got {options.frames}")
         self._interior = interior_of(options.seed)
@@ -80,7 +84,7 @@ class SimulatedRooms(SimulatedWorld):
         return irradiance_of(self.options.seed, "exposure" in self.options.hazards)
 
     def _moments(self, seconds: FloatArray, options: SimulationOptions) -> FloatArray:
-        """Where in the motion the camera is at times ``(N,)``: it is put down in the middle, if wanted."""
+        """Where in the motion the camera is at times ``(N,)``: it may be put down halfway."""
         if "stop" not in options.hazards:
             return seconds
         middle = 0.5 * max(options.frames / options.rate - STILL_S, 0.0)
@@ -187,7 +191,7 @@ class SimulatedRooms(SimulatedWorld):
         read = [self._brightness(int(tick)) for tick in np.linspace(0, last, _METERED)]
         return float(_GREY / np.median(read))
 
-    @functools.lru_cache(maxsize=256)  # noqa: B019 - a reading is small, and a world is kept for long
+    @functools.lru_cache(maxsize=256)  # noqa: B019 - readings are small, worlds are kept for long
     def _brightness(self, tick: int) -> float:
         """Mean of a coarse image without textures, as the camera's meter sees it."""
         moment = self._moments(np.array([tick * _METER_S]), self.options)

@@ -29,9 +29,8 @@ ACCELERATION = 0.022  # along the road, metres per frame squared
 FEWEST_LOOP_FRAMES = 250
 MARGIN = 42.0  # depth of the outermost lots, metres
 SMALLEST_BLOCK = 22.0  # between two street centres, metres
-_ROADS: dict[
-    StreetKind, tuple[float, float, float, tuple[float, float]]
-] = {  # blocks, side streets, half width
+# shortest and longest block, metres; share of side streets; lowest and highest half width, metres
+_ROADS: dict[StreetKind, tuple[float, float, float, tuple[float, float]]] = {
     "town": (38.0, 85.0, 0.45, (4.6, 5.2)),
     "avenue": (50.0, 110.0, 0.3, (4.6, 7.0)),
     "country": (90.0, 180.0, 0.3, (2.9, 4.2)),
@@ -64,9 +63,14 @@ class StreetPlan:
 
 
 def loop_cycle(rng: np.random.Generator, edges: int) -> list[Node]:
-    """Outline of a random simply connected set of cells, with left and right corners, of ``edges`` (even, 8 or more).
+    """Outline of a random simply connected set of cells, with left and right corners.
 
-    Its nodes in order, clockwise or counter-clockwise; the smallest coordinates are zero.
+    Args:
+        rng: draws it.
+        edges: of the outline, an even number of 8 or more.
+
+    Returns:
+        Its nodes in order, clockwise or counter-clockwise; the smallest coordinates are zero.
     """
     while True:
         cells = {(0, 0)}
@@ -78,9 +82,8 @@ def loop_cycle(rng: np.random.Generator, edges: int) -> list[Node]:
         if cycle is None:
             continue
         steps = np.diff([*cycle, *cycle[:2]], axis=0)
-        turns = np.sign(
-            steps[:-1, 0] * steps[1:, 1] - steps[:-1, 1] * steps[1:, 0]
-        )  # 1 left, -1 right, 0 straight on
+        # 1 left, -1 right, 0 straight on
+        turns = np.sign(steps[:-1, 0] * steps[1:, 1] - steps[:-1, 1] * steps[1:, 0])
         if len(np.unique(turns)) < 3:
             continue
         low = np.min(cycle, axis=0)
@@ -89,9 +92,13 @@ def loop_cycle(rng: np.random.Generator, edges: int) -> list[Node]:
 
 
 def grid_walk(rng: np.random.Generator, side: int, edges: int, spare: int) -> list[Node]:
-    """A walk on ``side`` x ``side`` nodes without U-turns that repeats streets, also in the opposite direction.
+    """A walk without U-turns that repeats streets, also in the opposite direction.
 
-    It does so within ``edges``, and has some ``spare`` ones, in case the drive comes so far.
+    Args:
+        rng: draws it.
+        side: of the square of nodes that it is on.
+        edges: within which it repeats streets.
+        spare: further edges, in case the drive comes so far.
     """
     best: tuple[float, list[Node]] = (-1.0, [])
     for _ in range(300):
@@ -127,8 +134,12 @@ def town_plan(
 ) -> StreetPlan:
     """Lay streets under a drive over nodes, smallest coordinates zero, and some more beside it.
 
-    ``spacing`` is the mean distance of parallel streets in metres, ``side_streets`` the probability that an edge which
-    is not driven is a street.
+    Args:
+        rng: draws what is not driven.
+        drive: the nodes in the order in which the camera passes them.
+        spacing: mean distance of parallel streets, metres.
+        side_streets: the probability that an edge which is not driven is a street.
+        kind: of the streets.
     """
     span = np.max(drive, axis=0)
     lines = [_lines(rng, int(count), spacing) for count in span]
@@ -200,9 +211,8 @@ class Route:
     bend: Bend  # from plan to street coordinates
     T_street_camera: FloatArray  # (N, 4, 4); street: x east, y north, z up, metres
     camera_height_m: float  # of the camera at rest above the road
-    lane_street: (
-        FloatArray  # the driven path on the road, at least STEP metres of plan each, (M, 3)
-    )
+    # the driven path on the road, at least STEP metres of plan each, (M, 3)
+    lane_street: FloatArray
     lane_offset_m: float  # from the middle of the street to the right
     sample: FloatArray  # where in lane_street each frame is, (N,)
 
@@ -210,10 +220,15 @@ class Route:
 def plan_route(
     route: str, frames: int, seed: int, still_frames: int = 0, variety: Variety | None = None
 ) -> Route:
-    """Lay out streets and a drive of so many frames over them; ``still_frames`` stand in the middle.
+    """Lay out streets and a drive over them.
 
-    A ``loop`` drives its start again, a ``grid`` repeats streets in both directions (with about 250 frames), and
-    ``straight`` never comes back. Without a ``variety`` it is a town, and a camera like KITTI's.
+    Args:
+        route: a ``loop`` drives its start again, a ``grid`` repeats streets in both directions
+            (with about 250 frames), and ``straight`` never comes back.
+        frames: of the drive.
+        seed: of every draw.
+        still_frames: how many of the frames stand in the middle.
+        variety: of the streets and the camera; without one it is a town, and a camera like KITTI's.
 
     Raises:
         SequenceError: if there are too few frames for the route.
@@ -275,7 +290,7 @@ def _layout(
         rng = np.random.default_rng([seed, 0])
         cycle = loop_cycle(rng, edges)
         plan = town_plan(rng, cycle + cycle + cycle[:1], spacing, side_streets=0.35, kind=kind)
-        # around a cycle that is driven twice, cut off ``OVERLAP`` metres after its start is revisited
+        # around a cycle that is driven twice, cut off ``OVERLAP`` metres after its start is met
         first, second = plan.node(plan.drive[0]), plan.node(plan.drive[1])
         lane_plan = _lane(plan, seed)[int(0.5 * float(np.linalg.norm(second - first)) / STEP) :]
         away = np.linalg.norm(lane_plan - lane_plan[0], axis=1)
@@ -296,7 +311,7 @@ def _lane_offset(plan: StreetPlan, seed: int) -> float:
 
 
 def _lane(plan: StreetPlan, seed: int) -> FloatArray:
-    """The whole driven path: right-hand lane with rounded corners and a little drift, ``(M, 2)``."""
+    """The whole driven path ``(M, 2)``: right-hand lane, rounded corners and a little drift."""
     rng = np.random.default_rng([seed, 3])
     nodes = np.stack([plan.node(node) for node in plan.drive])  # (n, 2)
     offset = _lane_offset(plan, seed)
@@ -308,11 +323,9 @@ def _lane(plan: StreetPlan, seed: int) -> FloatArray:
     for node, before, after, turn in zip(nodes[1:-1], right[:-1], right[1:], turns):
         corners.append(node + offset * (before + after if abs(turn) > 0.5 else after))
     corners.append(nodes[-1] + offset * right[-1])
-    rounded = [
-        point
-        for three in zip(corners[:-2], corners[1:-1], corners[2:])
-        for point in _corner(rng, *three)
-    ]
+    rounded: list[FloatArray] = []
+    for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:]):
+        rounded += _corner(rng, before, corner, after)
     path = _resample(np.stack([corners[0], *rounded, corners[-1]]))
     path = gaussian_filter1d(path, 1.6 / STEP, axis=0, mode="nearest")
     tangent = np.gradient(path, axis=0)
@@ -326,7 +339,7 @@ def _lane(plan: StreetPlan, seed: int) -> FloatArray:
 def _corner(
     rng: np.random.Generator, before: FloatArray, corner: FloatArray, after: FloatArray
 ) -> list[FloatArray]:
-    """An arc of 8.5 to 11 m radius, less where the edges are short; nothing but the corner if straight on."""
+    """An arc of 8.5 to 11 m radius, less where edges are short; the corner alone if straight on."""
     a, b = before - corner, after - corner
     shorter = min(float(np.linalg.norm(a)), float(np.linalg.norm(b)))
     a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
@@ -377,7 +390,7 @@ def _poses(
     height_m: float,
     variety: Variety | None,
 ) -> FloatArray:
-    """``T_street_camera`` ``(N, 4, 4)`` at fractional lane points ``sample`` ``(N,)``, with suspension.
+    """``T_street_camera`` ``(N, 4, 4)`` at fractional lane points ``sample`` ``(N,)``, suspended.
 
     Without a ``variety`` the camera was mounted level but for a little pitch.
     """
@@ -395,11 +408,11 @@ def _poses(
     right -= (right * forward).sum(axis=1, keepdims=True) * forward
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     down = np.cross(forward, right)
-    # suspension: pitch, yaw and roll about x, y, z in radians and height in metres, correlated in time, (N, 4)
+    # suspension: pitch, yaw and roll about x, y, z in radians and height in metres, correlated in
+    # time, (N, 4)
     white = rng.standard_normal((len(at) + 60, 4))
-    slow, fast = (
-        gaussian_filter1d(white, sigma, axis=0) * np.sqrt(3.54 * sigma) for sigma in (8.0, 2.0)
-    )
+    slow = gaussian_filter1d(white, 8.0, axis=0) * np.sqrt(3.54 * 8.0)
+    fast = gaussian_filter1d(white, 2.0, axis=0) * np.sqrt(3.54 * 2.0)
     mixed = (0.8 * slow + 0.6 * fast)[30:-30]
     sizes = np.array([np.deg2rad(0.3), np.deg2rad(0.2), np.deg2rad(0.3), 0.012])
     suspension = np.clip(mixed, -2.2, 2.2) * sizes

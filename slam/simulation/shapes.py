@@ -1,4 +1,4 @@
-"""Simple bodies that objects are made of, the colours they may have and the frames they stand on."""
+"""Simple bodies that objects are made of, their colours and the frames they stand on."""
 
 import numpy as np
 
@@ -18,7 +18,11 @@ def colour(
 
 
 def frame_at(x: float, y: float, angle: float, z: float = 0.0) -> FloatArray:
-    """Plan frame at a place, x axis turned by ``angle`` from east: rows x, y, z axis and origin, ``(4, 3)``."""
+    """Frame at a place in the plan, its x axis turned by ``angle`` radians from east.
+
+    Returns:
+        The x, y and z axis and the origin as rows, ``(4, 3)``.
+    """
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0], [x, y, z]])
 

@@ -1,4 +1,4 @@
-"""An embedded street world: images, exact depth, exact poses and LiDAR scans of a drive under a sky, with hazards.
+"""A street as a world: images, exact depth and poses, and LiDAR scans of a drive under a sky.
 
 Surfaces are ray-cast with Open3D; everything else is NumPy (``slam/simulation``).
 """
@@ -57,7 +57,11 @@ class SimulatedStreet(SimulatedWorld):
     T_camera_lidar: FloatArray
 
     def __init__(self, options: SimulationOptions) -> None:
-        """Plan the drive; ``SequenceError`` where there are too few frames for the route."""
+        """Plan the drive.
+
+        Raises:
+            SequenceError: if there are too few frames for the route.
+        """
         size = options.width, options.height
         still = STILL_FRAMES if "stop" in options.hazards else 0
         variety = (
@@ -75,9 +79,8 @@ class SimulatedStreet(SimulatedWorld):
             draw_varied_weather(options.seed) if options.varied else draw_weather(options.seed)
         )
         rng = np.random.default_rng([options.seed, 31])
-        self._exposure = np.empty(
-            (options.frames, 2)
-        )  # gain and gamma of every frame, piecewise constant
+        # gain and gamma of every frame, piecewise constant
+        self._exposure = np.empty((options.frames, 2))
         start = 0
         while start < options.frames:
             stop = start + int(rng.integers(12, 45))
@@ -90,11 +93,11 @@ class SimulatedStreet(SimulatedWorld):
         )
 
     def scan(self, index: int) -> Float32Array:
-        """LiDAR points of one frame: x, y, z in the LiDAR frame, metres, and reflectance, ``(M, 4)``."""
+        """LiDAR points of a frame ``(M, 4)``: x, y, z in the LiDAR, metres, and reflectance."""
         self._require(index)
         rng = np.random.default_rng([self.options.seed, 40, index])
-        # each spin starts at a random angle: with the same rays in every scan the rings on the ground would repeat
-        # exactly, and scan matching would estimate zero motion
+        # each spin starts at a random angle: with the same rays in every scan the rings on the
+        # ground would repeat exactly, and scan matching would estimate zero motion
         azimuth = (np.arange(COLUMNS) + rng.uniform()) * (2.0 * np.pi / COLUMNS)
         elevation = np.deg2rad(np.linspace(HIGHEST_DEG, LOWEST_DEG, BEAMS))[:, None]
         elevation = elevation + rng.normal(0.0, ELEVATION_NOISE, (BEAMS, COLUMNS))
@@ -129,7 +132,7 @@ class SimulatedStreet(SimulatedWorld):
 
     @functools.cached_property
     def _bonnet(self) -> Moving | None:
-        """The bonnet of the own car; none under motion blur, which would smear it against the camera."""
+        """The bonnet of the own car; none under motion blur, which would smear it."""
         if self._variety is None or self._variety.bonnet == 0.0 or "blur" in self.options.hazards:
             return None
         rng = np.random.default_rng([self.options.seed, 12])
@@ -204,9 +207,8 @@ class SimulatedStreet(SimulatedWorld):
         )
         lit = np.ones(self.options.height * self.options.width, dtype=np.float32)
         lit[pixels[towards]] = 1.0 - shadow
-        soft = cv2.blur(
-            lit.reshape(self.options.height, self.options.width), (3, 3)
-        )  # over neighbouring pixels
+        # over neighbouring pixels
+        soft = cv2.blur(lit.reshape(self.options.height, self.options.width), (3, 3))
         lit = np.asarray(np.take(soft, pixels), dtype=np.float32)
         rgb = surfaces[number].unlit(hits, self.camera.fx)
         if weather.contrast != 1.0:
@@ -267,9 +269,8 @@ class Weather:
     horizon: Float32Array  # colour of the sky low down, and of the haze, (3,)
     clouds: float  # cover, 0 to 1
     visibility_m: float  # distance at which the haze has taken 63 %
-    exposure: (
-        float | None
-    )  # gain of the camera; None sets it so that a share of the pixels saturates
+    # gain of the camera; None sets it so that a share of the pixels saturates
+    exposure: float | None
     saturated: float = 0.0  # that share
     contrast: float = 1.0  # of textures, an exponent; 1 as they are painted
 
@@ -303,7 +304,10 @@ def draw_weather(seed: int) -> Weather:
 
 
 def draw_varied_weather(seed: int) -> Weather:
-    """Weather of a varied world: three in four have a sun beside which shadows are 3 to 10 times as dark."""
+    """Weather of a varied world.
+
+    Three in four have a sun beside which shadows are 3 to 10 times as dark.
+    """
     rng = np.random.default_rng([seed, 21])
     sun = _draw_sun(rng, 0.3, 1.15)
     sunny = rng.random() < 0.75
@@ -331,7 +335,7 @@ def draw_varied_weather(seed: int) -> Weather:
 
 
 class Traffic:
-    """Moving cars: one ahead of the camera for a while, others oncoming; some overtake it if wanted."""
+    """Moving cars: one ahead of the camera for a while, others oncoming; some may overtake it."""
 
     def __init__(self, drive: Route, seed: int, overtaking: bool = False) -> None:
         rng = np.random.default_rng([seed, 33])

@@ -21,7 +21,9 @@ from slam.simulation.texture import (
 
 def _asphalt(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
     rgb = _junction(texels, colours, parameters)
-    half, dash, fraction = parameters[0, 0], parameters[1, 0], parameters[2, 0]
+    half = parameters[0, 0]
+    dash = parameters[1, 0]
+    fraction = parameters[2, 0]
     lengthways = stripes(texels.u, texels.u_size, float(2.0 * dash), float(2.0 * dash * fraction))
     lane = float(parameters[4, 0])
     if lane > 0.0:
@@ -30,9 +32,8 @@ def _asphalt(texels: Texels, colours: Float32Array, parameters: Float32Array) ->
     else:
         paint = lengthways * band(texels.v, texels.v_size, -0.07, 0.07)
     if parameters[3, 0] > 0.5:
-        low, high = (
-            (2.15, 2.03) if half > 4.5 else (0.35, 0.23)
-        )  # beside parked cars, or beside the verge
+        # beside parked cars, or beside the verge
+        low, high = (2.15, 2.03) if half > 4.5 else (0.35, 0.23)
         paint += band(np.abs(texels.v), texels.v_size, half - low, half - high)
     painted = np.flatnonzero(paint > 0.01)
     wear = np.clip(
@@ -153,7 +154,9 @@ def _roof(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Fl
 
 def _sign(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
     half, kind = parameters[0], parameters[1]
-    x, y, size = texels.u - half, texels.v - half, pixel_size(texels)
+    x = texels.u - half
+    y = texels.v - half
+    size = pixel_size(texels)
     edge = np.where(kind == 0, np.hypot(x, y), np.maximum(np.abs(x), np.abs(y))) / half
     rim = np.clip((edge - 0.72) * half / size + 0.5, 0.0, 1.0)
     bar = band(y, texels.v_size, -0.14 * half, 0.16 * half) * band(
@@ -161,7 +164,7 @@ def _sign(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Fl
     )
     plain = mix(colours[1], colours[0], np.maximum(rim, bar))
     inverse = mix(colours[0], colours[1], np.maximum(rim, bar))
-    return np.asarray(np.where((kind == 2), inverse, plain))
+    return np.asarray(np.where(kind == 2, inverse, plain))
 
 
 def _paint(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:

@@ -1,4 +1,4 @@
-"""Procedural textures: texture coordinates, noise and patterns that are filtered over a pixel's footprint."""
+"""What textures are made of: noise and patterns, filtered over the footprint of a pixel."""
 
 import functools
 from collections.abc import Callable
@@ -27,7 +27,8 @@ class Texels:
     shift_v: Float32Array  # the same along v
 
 
-# unlit RGB (3, N), about [0, 1], of texels by the two colours (2, 3, N) and the parameters (PARAMETERS, N) of instances
+# unlit RGB (3, N), about [0, 1], of texels by the two colours (2, 3, N) and the parameters
+# (PARAMETERS, N) of instances
 Shader = Callable[[Texels, Float32Array, Float32Array], Float32Array]
 
 
@@ -83,7 +84,7 @@ def fractal(texels: Texels, *octaves: tuple[float, float, float]) -> Float32Arra
 def stripes(
     x: Lengths, size: Lengths, period: Lengths | float, width: Lengths | float
 ) -> Float32Array:
-    """Fraction of each pixel covered by stripes [k period, k period + width], filtered over ``size``."""
+    """Fraction of each pixel of a ``size`` that stripes [k period, k period + width] cover."""
     half = 0.5 * np.maximum(size, 1e-4)
 
     def integral(at: Lengths) -> Lengths:

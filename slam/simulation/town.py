@@ -14,7 +14,14 @@ ROUNDING = 5.0  # radius of kerbs at corners, metres
 
 
 def build_town(plan: StreetPlan, bend: Bend, seed: int, varied: bool = False) -> Mesh:
-    """Every static surface of the world, in street coordinates; a varied one also has railings and people."""
+    """Every static surface of the world, in street coordinates.
+
+    Args:
+        plan: the streets.
+        bend: from the plan to street coordinates.
+        seed: of the world.
+        varied: whether there are railings, posts and people as well.
+    """
     rng = np.random.default_rng([seed, 10])
     town = _Town(plan, rng, np.random.default_rng([seed, 11]) if varied else None)
     town.ground()
@@ -34,7 +41,10 @@ class _Town:
     def __init__(
         self, plan: StreetPlan, rng: np.random.Generator, more: np.random.Generator | None
     ) -> None:
-        self.plan, self.rng, self.more, self.soup = plan, rng, more, Soup(rng)
+        self.plan = plan
+        self.rng = rng
+        self.more = more
+        self.soup = Soup(rng)
         self.density = float(rng.uniform(0.5, 0.9))  # of buildings
         self.parking = float(rng.uniform(0.1, 0.6))  # of cars along the kerb
         self.greenery = float(rng.uniform(0.25, 0.8))
@@ -46,7 +56,9 @@ class _Town:
         stone = colour(rng, (0.55, 0.54, 0.52), (0.50, 0.46, 0.43), spread=0.04)
         turf = colour(rng, (0.26, 0.36, 0.14), (0.34, 0.38, 0.18), spread=0.02)
         paint = np.array([0.80, 0.80, 0.76])
-        dash, fraction, edged = rng.uniform(3.0, 6.0), rng.uniform(0.35, 0.6), rng.random() < 0.7
+        dash = rng.uniform(3.0, 6.0)
+        fraction = rng.uniform(0.35, 0.6)
+        edged = rng.random() < 0.7
         lanes = LANE if plan.kind == "motorway" else 0.0
         smooth = 0.0 if more is None else float(more.uniform(0.2, 0.85))
         lines = (plan.half_width, float(dash), float(fraction), float(edged), lanes, smooth)
@@ -91,7 +103,7 @@ class _Town:
                     rectangle, 0.0 if crossed else KERB, self.junction if crossed else self.grass
                 )
                 if crossed:
-                    # asphalt outside the rounded kerbs, and a hair lower where it runs below the blocks
+                    # asphalt outside the rounded kerbs, a hair lower where it runs below the blocks
                     reach = half + ROUNDING
                     for x0, x1 in ((x - reach, x - half), (x + half, x + reach)):
                         for y0, y1 in ((y - reach, y - half), (y + half, y + reach)):
@@ -125,9 +137,8 @@ class _Town:
         x0, x1 = float(plan.xs[i]) + half, float(plan.xs[i + 1]) - half
         y0, y1 = float(plan.ys[j]) + half, float(plan.ys[j + 1]) - half
         nodes = [(i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1)]
-        sides = [
-            plan.is_street(*edge) for edge in zip(nodes, nodes[1:] + nodes[:1])
-        ]  # south, east, north, west
+        # south, east, north, west
+        sides = [plan.is_street(*edge) for edge in zip(nodes, nodes[1:] + nodes[:1])]
         width = self.pavement_width
         inner = (x0 + width, y0 + width, x1 - width, y1 - width)
         self._pavement((x0, y0, x1, y1), inner, sides)
@@ -144,12 +155,12 @@ class _Town:
         """A ring of paving between a rounded outline and the lots, and the kerb below its edge."""
         rim, corners = [], corners_of(outer)
         for k in range(4):
-            here, after, before = corners[k], corners[(k + 1) % 4], corners[k - 1]
+            here = corners[k]
+            after = corners[(k + 1) % 4]
+            before = corners[k - 1]
             radius = ROUNDING if sides[k] and sides[k - 1] else 0.01
-            ahead, back = (
-                (after - here) / np.linalg.norm(after - here),
-                (before - here) / np.linalg.norm(before - here),
-            )
+            ahead = (after - here) / np.linalg.norm(after - here)
+            back = (before - here) / np.linalg.norm(before - here)
             for angle in np.linspace(0.0, np.pi / 2.0, 6):
                 rim.append(
                     here + radius * ((1.0 - np.sin(angle)) * back + (1.0 - np.cos(angle)) * ahead)
@@ -174,7 +185,7 @@ class _Town:
         self.soup.patch(lip, np.stack([np.stack([length] * 2), across], axis=2), self.kerb)
 
     def _furnish(self, start: FloatArray, end: FloatArray) -> None:
-        """Trees, lamps and signs along one kerb, which has its block on the left, and cars in front of it."""
+        """Trees, lamps and signs along a kerb with its block on the left, and cars before it."""
         rng = self.rng
         length, ahead, inward, angle = directed(start, end)
         along = 6.0
@@ -200,9 +211,8 @@ class _Town:
             along += float(rng.uniform(5.4, 7.5))
         if self.more is None:
             return
-        rng = (
-            self.more
-        )  # a railing along a part of the kerb, thin posts, and people on the pavement
+        # a railing along a part of the kerb, thin posts, and people on the pavement
+        rng = self.more
         if rng.random() < 0.45 and length > 16.0:
             first, last = np.sort(rng.uniform(6.0, length - 6.0, 2))
             foot = start + first * ahead + float(rng.uniform(0.2, 0.8)) * inward
@@ -234,7 +244,10 @@ class _Town:
         self._lot(lot, [k for k in range(4) if touches[k] and sides[k]])
 
     def _lot(self, lot: Rectangle, facing: list[int]) -> None:
-        """Build on a lot, or leave it open; ``facing`` lists the sides at a street (south, east, north, west)."""
+        """Build on a lot, or leave it open.
+
+        ``facing`` lists its sides at a street: 0 south, 1 east, 2 north, 3 west.
+        """
         rng, (x0, y0, x1, y1) = self.rng, lot
         if min(x1 - x0, y1 - y0) > 5.0 and rng.random() < (self.density if facing else 0.3):
             side = facing[0] if facing else 0
@@ -258,7 +271,9 @@ class _Town:
 
     def backdrop(self) -> None:
         """Trees and houses beyond the edge of town, so that no street ends in the sky."""
-        rng, xs, ys = self.rng, self.plan.xs, self.plan.ys
+        rng = self.rng
+        xs = self.plan.xs
+        ys = self.plan.ys
         corners = corners_of((xs[0], ys[0], xs[-1], ys[-1]))
         for side, start in enumerate(corners):
             length, ahead, inward, _ = directed(start, corners[(side + 1) % 4])

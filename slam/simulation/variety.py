@@ -21,12 +21,10 @@ class Variety:
     steepness: float  # of hills at most, rise over run
     wavelength_m: float  # of hills
     fov_deg: float  # of the camera, horizontal
-    aspect: (
-        float | None
-    )  # of the camera's own image, which is shrunk to the size asked for; None: of that size
-    centre: tuple[
-        float, float
-    ]  # of the lens beside the middle of the image, shares of its width and height
+    # of the camera's own image, which is shrunk to the size asked for; None: of that size
+    aspect: float | None
+    # of the lens beside the middle of the image, shares of its width and height
+    centre: tuple[float, float]
     height_m: float  # of the camera above the road at rest
     pitch: float  # of the camera, downwards, radians
     roll: float  # of the camera about its axis, clockwise, radians

@@ -1,4 +1,4 @@
-"""A simulated world: surfaces that rays meet, a camera that moves among them, and the truth about both.
+"""A simulated world: surfaces that rays meet, a camera that moves among them, and the truth.
 
 Rays are cast with Open3D; surfaces have a colour where they are met.
 """
@@ -33,7 +33,10 @@ class Surface:
         self.mesh, self.scene = mesh, scene_of(mesh.vertices, mesh.triangles)
 
     def cast(self, rays: Float32Array) -> dict[str, NDArray[Any]]:
-        """Where rays ``(N, 6)`` meet it: ``t_hit`` (infinite if nowhere), triangle and barycentric weights."""
+        """Where rays ``(N, 6)`` meet it, by Open3D's names.
+
+        They are ``t_hit`` (infinite if nowhere), the triangle and barycentric weights.
+        """
         answer = self.scene.cast_rays(import_open3d().core.Tensor(rays))
         return {name: answer[name].numpy() for name in ("t_hit", "primitive_ids", "primitive_uvs")}
 
@@ -80,7 +83,8 @@ def distances(scene: Any, points: FloatArray) -> FloatArray:
 def place_rays(T_scene_sensor: FloatArray, directions: Float32Array) -> Float32Array:
     """Origin and direction in the scene of directions ``(N, 3)`` in a sensor's frame, ``(N, 6)``.
 
-    Of several poses ``(H, 4, 4)`` each is that of an equal share of the directions in turn, as of the rows of an image.
+    Of several poses ``(H, 4, 4)`` each is that of an equal share of the directions in turn, as of
+    the rows of an image.
     """
     rays = np.empty((len(directions), 6), dtype=np.float32)
     if T_scene_sensor.ndim == 3:
@@ -112,9 +116,9 @@ def _footprint(
 ) -> tuple[Float32Array, Float32Array]:
     """Extent of a pixel on a surface along its u and v axes, grazing angle included.
 
-    A round pixel of size f ``(N,)``, metres at the surface's distance, seen by rays at angle a to the normals is an
-    ellipse of axes f and f / cos a; along a tangent t it extends f sqrt(1 + (ray . t)^2 / cos^2 a). All directions are
-    unit, ``(3, N)``.
+    A round pixel of size f ``(N,)``, metres at the surface's distance, seen by rays at angle a to
+    the normals is an ellipse of axes f and f / cos a; along a tangent t it extends
+    f sqrt(1 + (ray . t)^2 / cos^2 a). All directions are unit, ``(3, N)``.
     """
     cosine = np.abs((rays * normals).sum(axis=0))
     along_u = (rays * tangents).sum(axis=0)
@@ -136,7 +140,9 @@ class SimulatedFrame:
 
 
 class SimulatedWorld(ABC):
-    """A world and a way through it; frames are rendered on demand. The scene is x east, y north, z up, metres.
+    """A world and a way through it; frames are rendered on demand.
+
+    The scene is x east, y north, z up, metres.
 
     Attributes:
         options: what is simulated.
@@ -154,18 +160,15 @@ class SimulatedWorld(ABC):
         self, options: SimulationOptions, camera: Intrinsics, T_scene_camera: FloatArray
     ) -> None:
         """A world seen through a camera from poses ``(N, 4, 4)``."""
-        self.options, self.camera, self.K = (
-            options,
-            replace(camera, readout_s=options.readout_s),
-            camera.K,
-        )
+        self.options = options
+        self.camera = replace(camera, readout_s=options.readout_s)
+        self.K = camera.K
         self._T_scene_camera = T_scene_camera
         self.T_world_camera: FloatArray = se3.invert(T_scene_camera[0]) @ T_scene_camera
         self.T_world_camera[0] = np.eye(4)
         self._rays = camera.rays(camera.pixel_grid()).reshape(-1, 3).astype(np.float32)
-        self._stretch = np.linalg.norm(self._rays, axis=1).astype(
-            np.float32
-        )  # ray length per depth
+        # ray length per depth
+        self._stretch = np.linalg.norm(self._rays, axis=1).astype(np.float32)
 
     @abstractmethod
     def _build(self) -> Mesh:
@@ -188,11 +191,25 @@ class SimulatedWorld(ABC):
         rays: Float32Array,
         pixels: NDArray[np.int64],
     ) -> Float32Array:
-        """Colour ``(3, N)`` of hits on one of the surfaces by rays ``(N, 6)`` through pixels ``(N,)``."""
+        """Colour of hits on one of the surfaces.
+
+        Args:
+            surfaces: all of a frame.
+            number: which of them is hit.
+            hits: where, N of them.
+            rays: that hit it, ``(N, 6)``.
+            pixels: which the rays go through, ``(N,)``.
+
+        Returns:
+            RGB, about [0, 1], ``(3, N)``.
+        """
 
     @abstractmethod
     def _exposures(self, index: int) -> FloatArray:
-        """Poses from which the image is taken, which is their mean: ``(S, 4, 4)``, or ``(S, H, 4, 4)``, one a row."""
+        """Poses from which the image is taken, which is their mean.
+
+        They are ``(S, 4, 4)``, or ``(S, H, 4, 4)`` with one a row.
+        """
 
     @abstractmethod
     def _develop(self, rgb: Float32Array, index: int) -> Float32Array:
@@ -233,13 +250,13 @@ class SimulatedWorld(ABC):
         return distances(self._still.scene, points)
 
     def mesh_world(self) -> tuple[Float32Array, NDArray[np.uint32]]:
-        """Vertices ``(V, 3)`` in the frame of the first camera and triangles ``(T, 3)`` of what stands still."""
+        """What stands still: vertices ``(V, 3)`` in the first camera, triangles ``(T, 3)``."""
         mesh = self._still.mesh
         vertices = se3.apply(se3.invert(self._T_scene_camera[0]), mesh.vertices.astype(np.float64))
         return vertices.astype(np.float32), mesh.triangles
 
     def scan(self, index: int) -> Float32Array:
-        """LiDAR points of one frame: x, y, z in the LiDAR frame, metres, and reflectance, ``(M, 4)``."""
+        """LiDAR points of a frame ``(M, 4)``: x, y, z in the LiDAR, metres, and reflectance."""
         raise NotImplementedError(f"frame {index}: this world has no LiDAR")
 
     @functools.cached_property
@@ -253,7 +270,7 @@ class SimulatedWorld(ABC):
     def _view(
         self, surfaces: list[Surface], T_scene_camera: FloatArray
     ) -> tuple[Float32Array, Float32Array]:
-        """Colour ``(H, W, 3)``, about [0, 1], and z-depth ``(H, W)`` from a pose, or from one of each row."""
+        """Colour ``(H, W, 3)``, about [0, 1], and z-depth ``(H, W)`` from a pose, or one a row."""
         rays = place_rays(T_scene_camera, self._rays)  # z = 1, so that t is z-depth
         unit = np.ascontiguousarray(rays[:, 3:].T) / self._stretch  # (3, H * W)
         answers = [surface.cast(rays) for surface in surfaces]

@@ -28,10 +28,11 @@ from erfsfm.common.files import write_atomically
 from erfsfm.common.progress import Progress, duration, progress_bar, silent
 from erfsfm.common.table import Table
 from erfsfm.config import ExperimentConfig, load_experiment
+from erfsfm.data.discovery import named_recordings
 from erfsfm.data.prepared import write_prepared
 from erfsfm.data.split import split_recordings
 from erfsfm.evaluation.eigen import eigen_protocol, read_split
-from erfsfm.evaluation.protocols import named_recordings, pose_protocol
+from erfsfm.evaluation.pose_protocols import pose_protocol
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.model_record import read_record
 from erfsfm.training.keeper import OutputFolder

@@ -14,6 +14,7 @@ from typing import TypeVar
 
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import CAMERA_FILE, read_camera_file
+from erfsfm.common.readers.frame_range import EVERYTHING, FrameRange
 from erfsfm.common.readers.images import (
     first_size,
     has_images,
@@ -70,6 +71,33 @@ def discover(root: Path) -> list[Recording]:
             f"{entries or 'an empty folder'}"
         )
     return found
+
+
+def named_recordings(root: Path, name: str) -> list[Recording]:
+    """Recordings of a sequence, or their part that a name with frames means (``00[250:300]``); of its first camera.
+
+    Without a name they are all recordings of the root.
+    """
+    if not name:
+        return discover(root)
+    found: dict[str, list[Recording]] = {}
+    for each in discover(root):
+        for known in {each.name, each.sequence or each.name}:
+            found.setdefault(known, []).append(each)
+    span = FrameRange(name, 0, EVERYTHING) if name in found else FrameRange.parse(name)
+    if span.recording not in found:
+        raise DataError(
+            f"no sequence {span.recording} in {root}: found {', '.join(sorted(found)) or 'none'}"
+        )
+    camera = found[span.recording][0].images[0].parent
+    wholes = [whole for whole in found[span.recording] if whole.images[0].parent == camera]
+    parts = [whole.within(span.start, span.stop) for whole in wholes]
+    chosen = [part for part in parts if part is not None]
+    if not chosen:
+        raise DataError(
+            f"{name} names no frame of a recording: found {', '.join(w.frames_name for w in wholes)}"
+        )
+    return chosen
 
 
 def _recordings_at(root: Path) -> list[Recording]:

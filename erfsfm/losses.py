@@ -11,6 +11,16 @@ from torch import Tensor
 
 C1, C2 = 0.01**2, 0.03**2
 
+MAX_BOUND_RATIO = 1.5  # most over least
+FARTHEST = 100.0  # camera heights: weights do not grow beyond
+STEPS_PX = (1, 2, 4, 8)
+LEAST_HALF_WIDTH = 1e-3  # of bounds, log inverse depth: those of exact depth have none
+STILL = 0.01  # network units: added to the length of a step, against division by zero
+
+
+Bounds = tuple[Tensor, Tensor]
+"""Least and most inverse depth ``(B, 1, H, W)`` as measured: 0 where unbounded from below, infinite from above."""
+
 
 class BoxMean(torch.autograd.Function):
     """Mean over each 3 x 3 window, as ``avg_pool2d(x, 3, 1)``, by separable additions.
@@ -115,17 +125,6 @@ def edge_aware_smoothness(values: Tensor, image: Tensor) -> Tensor:
     weight_x = torch.exp(-_dx(image).abs().mean(dim=1, keepdim=True))
     weight_y = torch.exp(-_dy(image).abs().mean(dim=1, keepdim=True))
     return (_dx(normalised).abs() * weight_x).mean() + (_dy(normalised).abs() * weight_y).mean()
-
-
-MAX_BOUND_RATIO = 1.5  # most over least
-FARTHEST = 100.0  # camera heights: weights do not grow beyond
-STEPS_PX = (1, 2, 4, 8)
-LEAST_HALF_WIDTH = 1e-3  # of bounds, log inverse depth: those of exact depth have none
-STILL = 0.01  # network units: added to the length of a step, against division by zero
-
-
-Bounds = tuple[Tensor, Tensor]
-"""Least and most inverse depth ``(B, 1, H, W)`` as measured: 0 where unbounded from below, infinite from above."""
 
 
 def enlarged(disparity: Tensor, level: int, size: tuple[int, int]) -> Tensor:

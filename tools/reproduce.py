@@ -35,7 +35,7 @@ from erfsfm.evaluation.eigen import eigen_protocol, read_split
 from erfsfm.evaluation.pose_protocols import pose_protocol
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.model_record import read_record
-from erfsfm.training.keeper import OutputFolder
+from erfsfm.training.output_folder import OutputFolder
 from erfsfm.training.run import prepare, train
 
 GUIDE = Path(__file__).parents[1] / "docs" / "design" / "reproduction.md"

@@ -15,6 +15,7 @@ from erfsfm.common.errors import ConfigError, ErfsfmError
 from erfsfm.common.files import read_text
 
 M = TypeVar("M", bound=BaseModel)
+MAX_BYTES = 2**18
 
 
 class Section(BaseModel):
@@ -188,9 +189,6 @@ def _known_keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
 def _shown(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 80 else f"{text[:77]}..."
-
-
-MAX_BYTES = 2**18
 
 
 class YamlError(ConfigError):

@@ -21,6 +21,10 @@ Pictures = list[NDArray[np.float32]]  # colour in [0, 1]
 _EACH = 0.6  # chance of each weather
 _BLUR_SAMPLES = 6  # images averaged into a blurred one
 
+# An image does not show its focal length. Under a teacher lengths are those of a camera of this
+# focal length, in image heights (KITTI's), so that cameras and random crops agree (Yin et al. 2023, Metric3D).
+FOCAL_LENGTH = 1.9
+
 
 def augment(
     images: Images,
@@ -230,11 +234,6 @@ def _rained_on(images: Pictures, rng: np.random.Generator) -> Pictures:
         hazy = image + np.float32(veil) * (np.float32(grey) - image)
         wet.append(hazy + cover * (np.float32(0.9) - hazy))
     return wet
-
-
-# An image does not show its focal length. Under a teacher lengths are those of a camera of this
-# focal length, in image heights (KITTI's), so that cameras and random crops agree (Yin et al. 2023, Metric3D).
-FOCAL_LENGTH = 1.9
 
 
 def training_sample(

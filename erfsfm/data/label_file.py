@@ -1,7 +1,7 @@
-"""Files of labels in a prepared folder: both bounds of each pixel's inverse depth as a small picture in WebP.
+"""Files of labels in a prepared folder: bounds of each pixel's inverse depth as a small picture.
 
-A pixel has the code of its value and its kind: which bounds it has, and how far they are apart. Bounds are rounded by a
-third of a sigma on average.
+A pixel of the WebP has the code of its value and its kind: which bounds it has, and how far they are
+apart. Bounds are rounded by a third of a sigma on average.
 """
 
 from __future__ import annotations

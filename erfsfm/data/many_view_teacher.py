@@ -1,8 +1,9 @@
-"""The many-view teacher of whole drives: poses by the SLAM system once a drive, then a label for every few frames.
+"""The many-view teacher of whole drives: poses once a drive, then a label for every few frames.
 
-All of it is kept in a folder under a digest of the drive's images and camera, so that it is computed once. In a
-prepared folder a label is a small picture (`erfsfm.data.label_file`). The networks' package does not import the SLAM
-system: what goes between them are a folder of images and a trajectory.
+The SLAM system gives the poses. All of it is kept in a folder under a digest of the drive's images and
+camera, so that it is computed once. In a prepared folder a label is a small picture
+(`erfsfm.data.label_file`). The networks' package does not import the SLAM system: what goes between
+them are a folder of images and a trajectory.
 """
 
 from __future__ import annotations

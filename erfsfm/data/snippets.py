@@ -35,6 +35,8 @@ from erfsfm.data.window import (
 from erfsfm.geometry import Camera
 
 _VALIDATED = 40  # snippets: as many as the shipped weights were chosen by
+# what the simulator leaves unknown is sky; of a depth camera it may be anywhere
+FARTHEST_M = 200.0
 
 
 class SnippetDraws(IterableDataset[dict[str, Tensor]]):
@@ -252,9 +254,6 @@ def chances(
         if chosen.any():
             total += np.where(chosen, weight * each / each[chosen].sum(), 0)
     return np.asarray(total / total.sum()) if len(recordings) else total
-
-
-FARTHEST_M = 200.0  # what the simulator leaves unknown is sky; of a depth camera it may be anywhere
 
 
 class ExactLabels:

@@ -1,7 +1,7 @@
-"""Protocols of depth: trained networks on streets with true depth, or on drives whose depth is measured.
+"""Protocols of depth: trained networks on streets with true depth, or on drives that have none.
 
-On streets a baseline that uses no image stands beside the networks. On drives without truth static surfaces are
-measured from neighbouring frames at a run's poses.
+On streets a baseline that uses no image stands beside the networks. On drives without truth static
+surfaces are measured from neighbouring frames at a run's poses.
 """
 
 from __future__ import annotations

@@ -37,6 +37,10 @@ from erfsfm.inference import DepthPosePredictor, refuse_leak
 
 _STILL_M = 0.1
 _FLAT_ROAD_M = 20.0
+_FRAME = re.compile(
+    r"(?:(?P<date>\d{4}_\d\d_\d\d)/)?(?P<drive>(?P<day>\d{4}_\d\d_\d\d)_drive_\d{4})(?:_sync)?"
+    r"(?:/image_0(?P<camera>[23])/data/(?P<file>\d+)(?:\.\w+)?|\s+(?P<frame>\d+)(?:\s+(?P<side>[lr]))?)"
+)
 
 
 def read_split(split: str, root: Path) -> list[RawFrame]:
@@ -163,12 +167,6 @@ def _row(
     scales = np.array([error.scale for error in errors])
     row["scale_spread"] = float(scales.std() / scales.mean()) if scales.any() else None
     return row | {"images": len(errors), "left_out": wanted - len(errors), "leak": leak}
-
-
-_FRAME = re.compile(
-    r"(?:(?P<date>\d{4}_\d\d_\d\d)/)?(?P<drive>(?P<day>\d{4}_\d\d_\d\d)_drive_\d{4})(?:_sync)?"
-    r"(?:/image_0(?P<camera>[23])/data/(?P<file>\d+)(?:\.\w+)?|\s+(?P<frame>\d+)(?:\s+(?P<side>[lr]))?)"
-)
 
 
 @dataclass(frozen=True)

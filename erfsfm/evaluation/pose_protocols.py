@@ -1,4 +1,7 @@
-"""Protocol of poses: networks on snippets of sequences with true poses, beside constant velocity straight ahead."""
+"""Protocol of poses: trained networks on snippets of sequences with true poses.
+
+Constant velocity straight ahead, a baseline that uses no image, stands beside them.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Streets with true depth: simulated worlds, KITTI raw drives with LiDAR, and folders of images beside depth maps."""
+"""Streets with true depth.
+
+Simulated worlds, KITTI raw drives with LiDAR, and folders of images beside depth maps.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""Labels by flow alone: depth of one image from many neighbours at the poses of the SLAM system.
+"""Labels by flow alone: depth of an image from many neighbours at the poses of the SLAM system.
 
-Lengths are in heights of the camera over the road, the ground plane before the camera. Dense inverse search flow
-(Kroeger et al. 2016) to each neighbour, checked forwards and backwards, gives the inverse depth whose projection lies
-nearest to the flow's end point; the neighbours' answers are averaged where they agree.
+Lengths are in heights of the camera over the road, the ground plane before the camera. Dense inverse
+search flow (Kroeger et al. 2016) to each neighbour, checked forwards and backwards, gives the inverse
+depth whose projection lies nearest to the flow's end point; the neighbours' answers are averaged where
+they agree.
 """
 
 from __future__ import annotations

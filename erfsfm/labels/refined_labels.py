@@ -1,4 +1,7 @@
-"""Labels by learned depth that neighbours at the poses of the SLAM system refine, in heights of the camera."""
+"""Labels by learned depth that neighbours refine at the poses of the SLAM system.
+
+Lengths are in heights of the camera over the road.
+"""
 
 from __future__ import annotations
 

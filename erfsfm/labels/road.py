@@ -1,4 +1,7 @@
-"""The road in an image of which inverse depth is known: its plane, what lies on it, what seems to lie under it."""
+"""The road in an image of which inverse depth is known.
+
+Its plane, what lies on it, and what only seems to lie under it.
+"""
 
 from __future__ import annotations
 

@@ -46,6 +46,31 @@ ODOMETRY_DRIVES = {
     "10": ("2011_09_30_drive_0034", 0, 1201),
 }
 
+ODOMETRY_CALIBRATION = "calib.txt"
+CAM_TO_CAM = "calib_cam_to_cam.txt"
+VELO_TO_CAM = "calib_velo_to_cam.txt"
+IMU_TO_VELO = "calib_imu_to_velo.txt"
+_SHIPPED = {
+    ODOMETRY_CALIBRATION: "with the odometry images (data_odometry_calib.zip); copy it there",
+    **dict.fromkeys(
+        (CAM_TO_CAM, VELO_TO_CAM, IMU_TO_VELO), "as DATE_calib.zip; copy it beside the drives"
+    ),
+}
+ASPECT_TOLERANCE = 0.01
+CAMERA_HEIGHT_M = 1.65  # of the car's cameras above the road
+_SCALE_TOLERANCE = 0.15  # of a principal point from the middle, along both axes
+
+# packets of the GPS/INS
+_COLUMNS = 30
+VELOCITY_NORTH = 6  # columns, m/s
+VELOCITY_EAST = 7
+VELOCITY_UP = 10
+
+# scans
+VELODYNE_COLUMNS = 4
+_FARTHEST_M = 1e4
+_MOST_BYTES = 2**28  # 16 million points of four numbers
+
 
 @dataclass(frozen=True)
 class OdometryRoot:
@@ -121,23 +146,6 @@ def find_drives(dataset: Path) -> dict[str, Path]:
 def drive_name(text: str) -> str:
     """The canonical name of a drive that a user writes with or without its date folder and ``_sync``."""
     return Path(text).name.removesuffix("_sync")
-
-
-ODOMETRY_CALIBRATION = "calib.txt"
-CAM_TO_CAM, VELO_TO_CAM, IMU_TO_VELO = (
-    "calib_cam_to_cam.txt",
-    "calib_velo_to_cam.txt",
-    "calib_imu_to_velo.txt",
-)
-_SHIPPED = {
-    ODOMETRY_CALIBRATION: "with the odometry images (data_odometry_calib.zip); copy it there",
-    **dict.fromkeys(
-        (CAM_TO_CAM, VELO_TO_CAM, IMU_TO_VELO), "as DATE_calib.zip; copy it beside the drives"
-    ),
-}
-ASPECT_TOLERANCE = 0.01
-CAMERA_HEIGHT_M = 1.65  # of the car's cameras above the road
-_SCALE_TOLERANCE = 0.15  # of a principal point from the middle, along both axes
 
 
 class CalibrationFile:
@@ -244,13 +252,6 @@ def _rigid(R_a_b: FloatArray, t_a_b: FloatArray) -> FloatArray:
     T_a_b = np.eye(4)
     T_a_b[:3, :3], T_a_b[:3, 3] = R_a_b, t_a_b
     return T_a_b
-
-
-VELOCITY_NORTH, VELOCITY_EAST, VELOCITY_UP = 6, 7, 10  # columns, m/s
-_COLUMNS = 30
-VELODYNE_COLUMNS = 4
-_FARTHEST_M = 1e4
-_MOST_BYTES = 2**28  # 16 million points of four numbers
 
 
 def read_packet(path: Path) -> FloatArray:

@@ -8,6 +8,7 @@ Example: python tools/reproduce.py --kitti KITTI_ODOMETRY --raw KITTI_RAW --rows
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import re
@@ -189,9 +190,7 @@ def _require_tested(kitti: Path, raw: Path | None, split: str) -> None:
         frame.image_path()
 
 
-@one_line_errors()
-def main(words: Sequence[str] | None = None) -> None:
-    """Train what is missing, evaluate, write the tables after every training."""
+def _parser() -> argparse.ArgumentParser:
     parser = parser_of(__doc__)
     add = parser.add_argument
     add(
@@ -234,7 +233,13 @@ def main(words: Sequence[str] | None = None) -> None:
         default="auto",
         help="where the networks compute",
     )
-    options = parser.parse_args(words)
+    return parser
+
+
+@one_line_errors()
+def main(words: Sequence[str] | None = None) -> None:
+    """Train what is missing, evaluate, write the tables after every training."""
+    options = _parser().parse_args(words)
     workers = min(max((os.cpu_count() or 2) - 1, 1), 8)
     changes = [f"data.workers={workers}", f"data.cache_mb={8000 // workers}", *options.set]
     rows = paper_rows(options.rows)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from pydantic import Field
@@ -98,70 +98,119 @@ def usable(recordings: Sequence[Recording], length: int) -> list[Recording]:
 
 
 def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recording]]:
-    """Training and validation recordings of all roots, by the configuration's split, ranges and exclusions."""
+    """Training and validation recordings of all roots.
+
+    They are chosen by the configuration's split, ranges and exclusions; stops are left out.
+
+    Raises:
+        DataError: no roots, a name that fits no recording or kind of recordings, a range that begins
+            after the end of its recording, or nothing left to train or to validate on.
+    """
     if not config.roots:
         raise DataError("no data to train on: name data sets with --dataset ROOT or data.roots")
     split = read_split_file(config.split) if config.split else Split()
-    left_out = read_split_file(EIGEN).test_recordings if EIGEN in config.exclude else []
-    scenes = [FrameRange.parse(name) for name in left_out]
-    ranges = [FrameRange.parse(f"{key}[{span}]") for key, span in config.ranges.items()]
-    listed = [FrameRange.parse(name) for name in split.train]
-    held_out = [FrameRange.parse(name) for name in (*config.validation, *split.validation)]
-    excluded = [name for name in config.exclude if name != EIGEN]
-    never = [FrameRange.parse(name) for name in (*excluded, *split.test_recordings)]
-    unknown = [str(each) for each in never if each.recording.partition("/")[0] not in KINDS]
-    if unknown:
-        raise DataError(
-            f"data.exclude names '{unknown[0]}', but names of recordings begin with {_some(KINDS)}"
-        )
-    found = [recording for root in config.roots for recording in discover(root)]
-    names = _some([recording.name for recording in found])
-    for key, span in zip(config.ranges, ranges):
-        if not any(_spans(recording, [span]) for recording in found):
-            raise DataError(
-                f"data.ranges names '{key}', but no recording has that name; found {names}"
-            )
-    _require_begun(found, [*ranges, *listed, *held_out])
+    division = _Division(config, split)
+    found: list[Recording] = []
+    for root in config.roots:
+        found += discover(root)
+    division.require_found(found)
     training: list[Recording] = []
     validation: list[Recording] = []
     for recording in found:
-        validation += _parts(recording, held_out)
-        forbidden = [
-            *held_out,
-            *never,
-            *(scenes if recording.name.startswith("kitti_raw/") else []),
-        ]
-        chosen = next(
-            (each for each in (ranges, listed) if _spans(recording, each)), None
-        )  # ranges before a list
-        whole = [] if listed else [recording]
-        for part in whole if chosen is None else _parts(recording, chosen):
-            training += _rest(part, forbidden)
+        validation += _parts(recording, division.held_out)
+        for part in division.chosen(recording):
+            training += _rest(part, division.forbidden(recording))
     if not training:
         raise DataError(
-            f"nothing left to train on: every recording found ({names}) is excluded or used to validate or "
-            "test; see data.exclude, data.validation and data.split"
+            f"nothing left to train on: every recording found ({_names(found)}) is excluded or used "
+            "to validate or test; see data.exclude, data.validation and data.split"
         )
     if config.validation_share > 0:
         training, ends = _ends_split_off(training, config.validation_share)
         validation += ends
-    if (
-        not validation
-        and (split.validation or config.validation != _DEFAULT_VALIDATION)
-        and config.validation
-    ):
+    if not validation:
+        _require_none_wanted(config, split, found)
+    if config.validation != _DEFAULT_VALIDATION:
+        _warn_of_absent(config.validation, found)
+    return _without_stops(training), _without_stops(validation)
+
+
+class _Division:
+    """The frame ranges that a configuration and its split name.
+
+    Attributes:
+        ranges: parts that train, of the recordings they name; they come before those of the list.
+        listed: recordings or parts that train; without any, all that are found do.
+        held_out: what validates, and hence does not train.
+        never: what does not train, being excluded or used to test.
+        scenes: the same of KITTI raw drives: Eigen's test scenes, where they are excluded.
+    """
+
+    def __init__(self, config: DataConfig, split: Split) -> None:
+        left_out = read_split_file(EIGEN).test_recordings if EIGEN in config.exclude else []
+        self.scenes = _parsed(left_out)
+        self.keys = list(config.ranges)
+        self.ranges = _parsed(f"{key}[{span}]" for key, span in config.ranges.items())
+        self.listed = _parsed(split.train)
+        self.held_out = _parsed((*config.validation, *split.validation))
+        excluded = [name for name in config.exclude if name != EIGEN]
+        self.never = _parsed((*excluded, *split.test_recordings))
+        for each in self.never:
+            if each.recording.partition("/")[0] not in KINDS:
+                raise DataError(
+                    f"data.exclude names '{each}', but names of recordings begin with {_some(KINDS)}"
+                )
+
+    def require_found(self, found: Sequence[Recording]) -> None:
+        """Refuse ranges of recordings that are not there, or that are shorter."""
+        for key, each in zip(self.keys, self.ranges):
+            if not _is_found(each, found):
+                raise DataError(
+                    f"data.ranges names '{key}', but no recording has that name; "
+                    f"found {_names(found)}"
+                )
+        _require_begun(found, [*self.ranges, *self.listed, *self.held_out])
+
+    def chosen(self, recording: Recording) -> list[Recording]:
+        """The parts of a recording that train, if nothing forbids it."""
+        for named in (self.ranges, self.listed):
+            if _spans(recording, named):
+                return _parts(recording, named)
+        return [] if self.listed else [recording]
+
+    def forbidden(self, recording: Recording) -> list[FrameRange]:
+        """What of a recording does not train."""
+        scenes = self.scenes if recording.name.startswith("kitti_raw/") else []
+        return [*self.held_out, *self.never, *scenes]
+
+
+def _parsed(names: Iterable[str]) -> list[FrameRange]:
+    return list(map(FrameRange.parse, names))
+
+
+def _is_found(frames: FrameRange, found: Sequence[Recording]) -> bool:
+    return any(frames.counted_in(recording.name) is not None for recording in found)
+
+
+def _names(recordings: Sequence[Recording]) -> str:
+    return _some([recording.name for recording in recordings])
+
+
+def _require_none_wanted(config: DataConfig, split: Split, found: Sequence[Recording]) -> None:
+    """Refuse an empty validation where the configuration or its split name one."""
+    is_named = split.validation or config.validation != _DEFAULT_VALIDATION
+    if is_named and config.validation:
         wanted = _some([*config.validation, *split.validation])
         raise DataError(
-            f"nothing to validate on: data.validation and data.split name {wanted}; found {names}; name one of "
-            "these, or train without validation by data.validation=[]"
+            f"nothing to validate on: data.validation and data.split name {wanted}; found "
+            f"{_names(found)}; name one of these, or train without validation by data.validation=[]"
         )
-    named = config.validation if config.validation != _DEFAULT_VALIDATION else []
-    absent = [
-        name for name in named if not any(FrameRange.parse(name).counted_in(r.name) for r in found)
-    ]
+
+
+def _warn_of_absent(names: Sequence[str], found: Sequence[Recording]) -> None:
+    absent = [name for name in names if not _is_found(FrameRange.parse(name), found)]
     if absent:
         logger.warning("data.validation names %s, which is not among the data", _some(absent))
-    return _without_stops(training), _without_stops(validation)
 
 
 def _ends_split_off(

@@ -153,7 +153,8 @@ def disagreement(disparity: Tensor, bounds: Bounds, log_scale: float) -> Tensor:
     """
     has_least, has_most = bounds[0] > 0, torch.isfinite(bounds[1])
     scaled = disparity.log() - log_scale
-    least, most = (bound.clamp(min=1e-6).log() for bound in bounds)
+    least = bounds[0].clamp(min=1e-6).log()
+    most = bounds[1].clamp(min=1e-6).log()
     both = has_least & has_most
     middle = torch.where(both, (least + most) / 2, 0)
     half = torch.where(both, (most - least) / 2, 1).clamp(min=LEAST_HALF_WIDTH)
@@ -184,13 +185,10 @@ def step_disagreement(disparity: Tensor, bounds: Bounds) -> Tensor:
     for apart in STEPS_PX:
         for axis in (2, 3):
             length = max(error.shape[axis] - apart, 0)
-            first, second = (values.narrow(axis, 0, length) for values in (error, narrow))
-            first_on, second_on = (
-                values.narrow(axis, error.shape[axis] - length, length)
-                for values in (error, narrow)
-            )
-            both = second & second_on
-            total = total + ((first_on - first).abs() * both).sum() / both.sum().clamp(min=1)
+            start = error.shape[axis] - length
+            both = narrow.narrow(axis, 0, length) & narrow.narrow(axis, start, length)
+            step = error.narrow(axis, start, length) - error.narrow(axis, 0, length)
+            total = total + (step.abs() * both).sum() / both.sum().clamp(min=1)
     return total / (2 * len(STEPS_PX))
 
 

@@ -148,9 +148,8 @@ def _jobs(options: argparse.Namespace) -> list[p.Job]:
     if getattr(options, "kitti", None) is not None:
         drives += p.recordings(options.kitti.resolve(), options.sequences, options.excerpt)
     if getattr(options, "data", None) is not None:
-        drives += [
-            d for root in p.ORIGINALS for d in p.recordings(options.data.resolve() / root, (), None)
-        ]
+        for root in p.ORIGINALS:
+            drives += p.recordings(options.data.resolve() / root, (), None)
     configurations = MODES[options.mode].configurations
     parts = getattr(options, "parts", None)
     if parts is not None:

@@ -133,11 +133,11 @@ def _changed(config: ExperimentConfig, section: str, **values: Any) -> Experimen
 def ours(row: Row, results: Results) -> list[str]:
     """Our figures in the columns of the paper; a dash where there is none."""
     if not row.scale:
-        networks = [each for each in results.get("pose", []) if each["method"] == "networks"]
-        pairs = [
-            (each[f"{key}_mean"], each[f"{key}_std"]) for each in networks for key in ("ate", "re")
-        ]
-        figures = [f"{mean:.4f} ± {deviation:.4f}" for mean, deviation in pairs]
+        figures = []
+        for each in results.get("pose", []):
+            if each["method"] == "networks":
+                for key in ("ate", "re"):
+                    figures.append(f"{each[f'{key}_mean']:.4f} ± {each[f'{key}_std']:.4f}")
     else:
         scaling = {"GT": "gt-median", "PoseNet": "pose"}[row.scale]
         depth = next((each for each in results.get("depth", []) if each["scaling"] == scaling), {})

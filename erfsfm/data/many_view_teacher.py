@@ -140,9 +140,9 @@ class DriveLabels:
                 "--device",
                 "cpu",
             ]
-            reason = slam_process(
-                [*words, *(word for setting in _SETTINGS for word in ("--set", setting))]
-            )
+            for setting in _SETTINGS:
+                words += ["--set", setting]
+            reason = slam_process(words)
             if reason or not (output / _TRAJECTORY).is_file():
                 raise TrainingError(
                     f"the teacher's poses of {name} could not be found: {reason or 'it wrote none'}"
@@ -184,13 +184,10 @@ class DriveLabels:
             bounds = self._bounds(target, learned)
             if bounds is None:
                 bounds = np.zeros(self.size, np.float32), np.full(self.size, np.inf, np.float32)
-            least, most = (
-                cv2.resize(values, self.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(
-                    np.float16
-                )
-                for values in bounds
-            )
-            arrays = {"least": least, "most": most}
+            arrays = {}
+            for name, values in zip(("least", "most"), bounds):
+                resized = cv2.resize(values, self.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+                arrays[name] = resized.astype(np.float16)
             write_atomically(
                 self.label_file(target), partial(np.savez_compressed, **arrays), sync=False
             )
@@ -234,7 +231,12 @@ class DriveLabels:
 
     def _greys(self, frames: Iterable[int], camera: Camera) -> dict[int, Grey]:
         """Those frames that can be read."""
-        return {n: _grey(image) for n in frames if (image := self._image(n, camera)) is not None}
+        greys = {}
+        for n in frames:
+            image = self._image(n, camera)
+            if image is not None:
+                greys[n] = _grey(image)
+        return greys
 
     def _motion(self, target: int, others: Iterable[int]) -> NDArray[np.float64]:
         """``T_other_target`` ``(N, 4, 4)``."""
@@ -288,9 +290,10 @@ class ManyViewTeacher:
                 )
             else:
                 # of the camera, the names, sizes and times of the images, and the version of this file
-                stats = [(path.name, path.stat()) for path in sorted(set(recording.images))]
                 seen = [f"{VERSION} {recording.camera} {recording.start} {len(recording)}"]
-                seen += [f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in stats]
+                for path in sorted(set(recording.images)):
+                    stat = path.stat()
+                    seen.append(f"{path.name} {stat.st_size} {stat.st_mtime_ns}")
                 digest = hashlib.sha256("\n".join(seen).encode()).hexdigest()[:_DIGITS]
                 drive = DriveLabels(recording, self._folder / digest, self._size, self._stride)
             self._drives[recording.key] = drive
@@ -320,7 +323,7 @@ class ManyViewTeacher:
         """
         with FolderLock() as lock:
             lock.take(self._folder, waits=True)
-            drives = [self.drive(recording) for recording in recordings]
+            drives = list(map(self.drive, recordings))
             for drive in drives:
                 drive.require_weights(weights)
             without = [drive for drive in drives if not drive.poses_file.is_file()]
@@ -331,10 +334,8 @@ class ManyViewTeacher:
                     for target in drive.targets(sources)
                     if not drive.label_file(target).is_file()
                 ]
-                tasks += [
-                    (drive, missing[first : first + _CHUNK])
-                    for first in range(0, len(missing), _CHUNK)
-                ]
+                for first in range(0, len(missing), _CHUNK):
+                    tasks.append((drive, missing[first : first + _CHUNK]))
             for drive in (*without, *(drive for drive, _ in tasks)):
                 if drive.compact:
                     raise TrainingError(
@@ -350,10 +351,9 @@ class ManyViewTeacher:
                     progress("teacher: depth", drive.measure_labels(chunk), total)
             elif tasks:
                 with processes("measures labels") as pool:
-                    running = [
-                        pool.submit(drive.measure_labels, chunk, self._learned)
-                        for drive, chunk in tasks
-                    ]
+                    running = []
+                    for drive, chunk in tasks:
+                        running.append(pool.submit(drive.measure_labels, chunk, self._learned))
                     for future in as_completed(running):
                         done += future.result()
                         progress("teacher: depth", done, total)

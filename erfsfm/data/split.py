@@ -50,8 +50,11 @@ class Split(Section):
     @property
     def test_recordings(self) -> list[str]:
         """Recordings with a frame to test on, without their frames."""
-        matches = [(name.strip(), _FRAMES.fullmatch(name.strip())) for name in self.test]
-        return [name if match is None else match["recording"] for name, match in matches]
+        recordings = []
+        for name in self.test:
+            match = _FRAMES.fullmatch(name.strip())
+            recordings.append(name.strip() if match is None else match["recording"])
+        return recordings
 
     def test_frames(self) -> list[tuple[str, int]]:
         """Every single frame to test on: its recording and number."""
@@ -68,7 +71,8 @@ class Split(Section):
             for run in filter(None, runs):
                 first = int(run["first"])
                 numbers = range(first, int(run["stop"] or first + 1), int(run["step"] or 1))
-                frames += [(match["recording"], number) for number in numbers]
+                for number in numbers:
+                    frames.append((match["recording"], number))
         return frames
 
 
@@ -78,7 +82,10 @@ def read_split_file(name_or_path: str) -> Split:
     if not path.is_file():
         wheel, source = config_folders()  # beside the named configurations
         folders = wheel / "splits", source.parent / "splits"
-        shipped = {file.stem: file for folder in folders for file in sorted(folder.glob("*.yaml"))}
+        shipped: dict[str, Path] = {}
+        for folder in folders:
+            for file in sorted(folder.glob("*.yaml")):
+                shipped[file.stem] = file
         if name_or_path not in shipped:
             raise DataError(
                 f"no split '{name_or_path}': neither a file nor one of {', '.join(shipped)}"
@@ -248,20 +255,21 @@ def _spans(recording: Recording, ranges: Sequence[FrameRange]) -> list[FrameRang
 
 def _parts(recording: Recording, ranges: Sequence[FrameRange]) -> list[Recording]:
     """The parts of a recording that frame ranges name."""
-    parts = (recording.within(span.start, span.stop) for span in _spans(recording, ranges))
-    return [part for part in parts if part is not None]
+    parts: list[Recording] = []
+    for span in _spans(recording, ranges):
+        part = recording.within(span.start, span.stop)
+        parts += [] if part is None else [part]
+    return parts
 
 
 def _rest(recording: Recording, ranges: Sequence[FrameRange]) -> list[Recording]:
     """The parts of a recording before, between and after frame ranges."""
     rest = [recording]
     for span in _spans(recording, ranges):
-        sides = (
-            side
-            for part in rest
-            for side in (part.within(0, span.start), part.within(span.stop, EVERYTHING))
-        )
-        rest = [part for part in sides if part is not None]
+        sides: list[Recording | None] = []
+        for part in rest:
+            sides += [part.within(0, span.start), part.within(span.stop, EVERYTHING)]
+        rest = [side for side in sides if side is not None]
     return rest
 
 

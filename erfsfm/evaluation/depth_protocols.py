@@ -9,6 +9,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -67,15 +68,17 @@ def depth_protocol(
     Raises:
         DataError: no true depth under a root, or a leak that was not allowed.
     """
-    streets = [street for root in roots for street in find_streets(root)]
-    leaks = {
-        name: [refuse_leak(each, street.seen, allow_leak) for street in streets]
-        for name, each in networks.items()
-    }
-    total, done = sum(len(street.frames) for street in streets), 0
-    errors: dict[str, list[list[DepthErrors]]] = {
-        name: [[] for _ in streets] for name in (*networks, _BASELINE)
-    }
+    streets: list[Street] = []
+    for root in roots:
+        streets += find_streets(root)
+    leaks: dict[str, list[bool]] = {}
+    for name, each in networks.items():
+        leaks[name] = [refuse_leak(each, street.seen, allow_leak) for street in streets]
+    total = sum(len(street.frames) for street in streets)
+    done = 0
+    errors: dict[str, list[list[DepthErrors]]] = {}
+    for name in (*networks, _BASELINE):
+        errors[name] = [[] for _ in streets]
     for place, street in enumerate(streets):
         to_draw = pictures
         for load in street.frames:
@@ -84,13 +87,12 @@ def depth_protocol(
             guesses = {name: each.depth(image) for name, each in networks.items()}
             if street.typical is not None:
                 guesses[_BASELINE] = street.typical
-            found = {
-                name: depth_errors(guess, truth, CAP_M, street.crop)
-                for name, guess in guesses.items()
-            }
-            compared = {name: error for name, error in found.items() if error is not None}
-            for name, error in compared.items():
-                errors[name][place].append(error)
+            compared: dict[str, DepthErrors] = {}
+            for name, guess in guesses.items():
+                error = depth_errors(guess, truth, CAP_M, street.crop)
+                if error is not None:
+                    compared[name] = error
+                    errors[name][place].append(error)
             if to_draw is not None and compared:
                 scaled = [guesses[name] * np.float32(compared[name].scale) for name in networks]
                 jpeg, file = _picture(image, scaled, truth), f"{street.name.replace('/', '-')}.jpg"
@@ -131,19 +133,21 @@ def _picture(
 ) -> bytes:
     """A JPEG, image, depths in metres and truth below each other, at most `_PICTURE_WIDTH` wide; near is bright."""
     known = truth > 0
-    nearness = [1 / depth for depth in depths] + [np.where(known, 1 / np.where(known, truth, 1), 0)]
-    height, width = (round(n * min(1, _PICTURE_WIDTH / image.shape[1])) for n in image.shape[:2])
+    nearness = [1 / depth for depth in depths]
+    nearness.append(np.where(known, 1 / np.where(known, truth, 1), 0))
+    ratio = min(1, _PICTURE_WIDTH / image.shape[1])
+    height = round(image.shape[0] * ratio)
+    width = round(image.shape[1] * ratio)
     points = 1 + 2 * round(
         image.shape[1] / _PICTURE_WIDTH
     )  # of LiDAR, which would vanish in a smaller picture
     nearness[-1] = cv2.dilate(nearness[-1], np.ones((points, points)))
     brightest = np.percentile(nearness[-1][nearness[-1] > 0], 98)
-    shades = [np.clip(values / brightest * 255, 0, 255).astype(np.uint8) for values in nearness]
-    coloured = [cv2.applyColorMap(shade, cv2.COLORMAP_MAGMA) for shade in shades]
-    rows = [
-        cv2.resize(each, (width, height), interpolation=cv2.INTER_AREA)
-        for each in (image[..., ::-1], *coloured)
-    ]
+    shown = [image[..., ::-1]]
+    for values in nearness:
+        shade = np.clip(values / brightest * 255, 0, 255).astype(np.uint8)
+        shown.append(np.asarray(cv2.applyColorMap(shade, cv2.COLORMAP_MAGMA), np.uint8))
+    rows = [cv2.resize(each, (width, height), interpolation=cv2.INTER_AREA) for each in shown]
     return bytes(cv2.imencode(".jpg", np.vstack(rows))[1])
 
 
@@ -162,12 +166,10 @@ def _depth_row(
         row["ratio"], row["ratio_se"] = mean_ratio(
             abs_rel, [mean_errors(errors).abs_rel for errors in before]
         )
-    row |= {
-        f"{key}_reason": "one street"
-        for key in ("abs_rel_se", "ratio_se")
-        if key in row and row[key] is None
-    }
-    scales = np.array([each.scale for errors in streets for each in errors])
+    for key in ("abs_rel_se", "ratio_se"):
+        if key in row and row[key] is None:
+            row[f"{key}_reason"] = "one street"
+    scales = np.array([each.scale for each in chain.from_iterable(streets)])
     row["scale_spread"] = float(scales.std() / scales.mean())
     return row | {"images": len(scales), "streets": len(streets)}
 

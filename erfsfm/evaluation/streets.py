@@ -93,9 +93,8 @@ def _of_drives(root: Path) -> list[Street]:
     """KITTI raw drives by their scans, in the crop of Garg et al."""
     streets = []
     for drive, folder in find_drives(root).items():
-        scans = sorted(
-            int(path.stem) for path in (folder / "velodyne_points" / "data").glob("*.bin")
-        )
+        files = (folder / "velodyne_points" / "data").glob("*.bin")
+        scans = sorted(int(path.stem) for path in files)
         base = folder.absolute().parents[1]
         frames = [RawFrame(base, drive, index) for index in scans[::EVERY]]
         if frames:
@@ -116,12 +115,11 @@ def _scan(frame: RawFrame) -> tuple[Image, Depth]:
 def _of_recordings(root: Path) -> list[Street]:
     """Recordings with depth maps; the parts of one between gaps are one street."""
     recordings = [recording for recording in discover(root) if any(recording.depth or ())]
-    indices = [
-        np.flatnonzero([file is not None for file in r.depth or ()])[::EVERY] for r in recordings
-    ]
-    frames = [
-        (recording, int(index)) for recording, those in zip(recordings, indices) for index in those
-    ]
+    frames: list[tuple[Recording, int]] = []
+    for recording in recordings:
+        known = [index for index, file in enumerate(recording.depth or ()) if file is not None]
+        for index in known[::EVERY]:
+            frames.append((recording, index))
     truths = [_truth(recording, index) for recording, index in frames]
     if len({truth.shape for truth in truths}) > 1:
         raise DataError(

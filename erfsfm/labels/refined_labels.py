@@ -59,20 +59,24 @@ def shrunk(least: Array, most: Array, factor: int) -> tuple[Array, Array]:
     """
     if factor == 1:
         return least, most
-    height, width = (length // factor for length in least.shape)
     both = (least > 0) & np.isfinite(most)
-    with np.errstate(
-        divide="ignore", invalid="ignore"
-    ):  # a bound that is not known is 0 or infinite
-        low, high, middle = (
-            values.reshape(height, factor, width, factor).swapaxes(1, 2).reshape(height, width, -1)
-            for values in (np.log(least), np.log(most), np.where(both, np.log(least * most) / 2, 0))
-        )
+    with np.errstate(divide="ignore", invalid="ignore"):  # an unknown bound is 0 or infinite
+        low = _in_blocks(np.log(least), factor)
+        high = _in_blocks(np.log(most), factor)
+        middle = _in_blocks(np.where(both, np.log(least * most) / 2, 0), factor)
     spread = np.ptp(middle, axis=-1) / 2
     both = np.isfinite(low).all(-1) & np.isfinite(high).all(-1)
     known_low = np.where(both, low.mean(-1) - spread, low.min(-1))
     known_high = np.where(both, high.mean(-1) + spread, high.max(-1))
     return np.exp(known_low).astype(np.float32), np.exp(known_high).astype(np.float32)
+
+
+def _in_blocks(values: Array, factor: int) -> Array:
+    """Values ``(h * factor, w * factor)`` by block of pixels: ``(h, w, factor * factor)``."""
+    height = values.shape[0] // factor
+    width = values.shape[1] // factor
+    blocks = values.reshape(height, factor, width, factor).swapaxes(1, 2)
+    return blocks.reshape(height, width, -1)
 
 
 def in_camera_heights(learned: Array, measured: Array, sigma: Array) -> Array | None:

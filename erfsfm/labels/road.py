@@ -86,12 +86,17 @@ def on_road(inverse_depth: Array, known: NDArray[np.bool_], road: Array) -> NDAr
     height, width = inverse_depth.shape
     window = (2 * int(AROUND[1] * width / 2) + 1, 2 * int(AROUND[0] * height / 2) + 1)
     agreeing = known & (np.abs(inverse_depth - road) < NEAR * road)
-    ratio = [
-        cv2.blur(mask.astype(np.float32), window, borderType=cv2.BORDER_CONSTANT)
-        for mask in (known, agreeing)
-    ]
-    level = (road > 0) & (ratio[0] > LEAST_AROUND) & (ratio[1] > LEAST_AGREEING * ratio[0])
+    known_share = _mean_around(known, window)
+    agreeing_share = _mean_around(agreeing, window)
+    level = (road > 0) & (known_share > LEAST_AROUND)
+    level &= agreeing_share > LEAST_AGREEING * known_share
     return np.asarray(level & ~(known & (np.abs(inverse_depth - road) > NEAR * road)))
+
+
+def _mean_around(mask: NDArray[np.bool_], window: tuple[int, int]) -> Array:
+    """Share of the window ``(width, height)`` around each pixel that a mask holds, ``(H, W)``."""
+    share = cv2.blur(mask.astype(np.float32), window, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(share, np.float32)
 
 
 def under_road(inverse_depth: Array, sigma: Array, road: Array) -> NDArray[np.bool_]:

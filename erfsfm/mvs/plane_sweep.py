@@ -90,8 +90,8 @@ def lowest(costs: Costs) -> Array:
     """The change ``(h, w)`` of least cost, between samples by a parabola."""
     best = costs.argmin(axis=0)
     middle = np.clip(best, 1, len(costs) - 2)
-    around = (np.take_along_axis(costs, (middle + k)[None], axis=0)[0] for k in (-1, 0, 1))
-    before, at, after = (cost.astype(np.float32) for cost in around)
+    around = middle + np.array([-1, 0, 1])[:, None, None]
+    before, at, after = np.take_along_axis(costs, around, axis=0).astype(np.float32)
     shift = np.clip((before - after) / (2 * np.maximum(before + after - 2 * at, 1)), -0.5, 0.5)
     position = np.where(best == middle, middle + shift, best)
     return np.asarray(np.interp(position, np.arange(len(costs)), CHANGES), np.float32)

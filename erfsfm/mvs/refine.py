@@ -82,13 +82,15 @@ def measure(
     (height, width), (h, w) = depth.shape, target.coarse.shape
     inverse = (1 / depth).astype(np.float32)
     small = np.asarray(cv2.resize(inverse, (w, h), interpolation=cv2.INTER_AREA), np.float32)
-    pairs = list(zip(neighbours, T_neighbour_target))
-    costs = sweep(
-        target.coarse, [(other.coarse, Projection(halved(K), T, h, w)) for other, T in pairs], small
-    )
+    views: list[tuple[Appearance, Projection]] = []
+    small_views: list[tuple[Array, Projection]] = []
+    for other, T in zip(neighbours, T_neighbour_target):
+        views.append((other, Projection(K, T, height, width)))
+        small_views.append((other.coarse, Projection(halved(K), T, h, w)))
+    costs = sweep(target.coarse, small_views, small)
     coarse = lowest(smoothed(costs, target.coarse_grey))
     change = _enlarged(np.asarray(cv2.medianBlur(coarse, 5), np.float32), target)
-    views = [(other, Projection(K, T, height, width)) for other, T in pairs]
+
     for _ in range(STEPS):
         step, information, fit = _gauss_newton(target.levels, views, inverse * np.exp(change))
         change += step
@@ -98,8 +100,10 @@ def measure(
 def _enlarged(change: Array, target: Appearance) -> Array:
     """To full size ``(H, W)``: a pixel takes the change of the one of four at half size with the nearest grey level."""
     height, width = target.grey.shape
-    changes, greys = (_doubled(part) for part in (change, target.coarse_grey))
-    best, nearest = np.empty_like(target.grey), np.full_like(target.grey, np.inf)
+    changes = _doubled(change)
+    greys = _doubled(target.coarse_grey)
+    best = np.empty_like(target.grey)
+    nearest = np.full_like(target.grey, np.inf)
     for top in (0, 2):
         for left in (0, 2):
             at = slice(top, top + height), slice(left, left + width)
@@ -127,9 +131,8 @@ def _gauss_newton(
         inside = is_inside(residual)
         residual *= inside
         weight = inside / np.square(1 + np.square(residual * np.float32(1 / RESIDUAL)))
-        along_x, along_y = (warped(slope, u, v) for slope in other.slopes)
         du, dv = projection.motion(u, v, z, inverse_depth)
-        slope = along_x * du + along_y * dv
+        slope = warped(other.slopes[0], u, v) * du + warped(other.slopes[1], u, v) * dv
         weighted = weight * slope
         squares += weighted * slope
         products += weighted * residual

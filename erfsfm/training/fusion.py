@@ -18,6 +18,7 @@ from erfsfm.common.files import write_atomically
 from erfsfm.common.processes import processes
 from erfsfm.common.progress import Progress
 from erfsfm.data.discovery import discover
+from erfsfm.data.recordings import Recording
 from erfsfm.inference import DepthPosePredictor, has_bfloat16
 from erfsfm.mvs.fusion import CHANGE, CHANNELS, FILE, FULL_SIZE, STEP
 from erfsfm.networks.torch_network import exported
@@ -112,7 +113,9 @@ def _drawn(
 
 
 def _chunk(roots: Sequence[Path], weights: str, seed: int) -> list[Sample]:
-    recordings = [recording for root in roots for recording in discover(root)]
+    recordings: list[Recording] = []
+    for root in roots:
+        recordings += discover(root)
     source = FusionSamples(
         recordings, DepthPosePredictor.from_weights(weights, runtime="onnx"), seed
     )
@@ -229,6 +232,7 @@ def _fit_sigma(net: FusionNet, data: Sequence[Sample]) -> dict[str, float]:
     assert net.head.bias is not None
     net.head.bias[8:] += torch.log(factor)
     all_errors = {name: torch.cat(parts) for name, parts in errors.items()}
-    return {f"{name}_mean": float(e.mean()) for name, e in all_errors.items()} | {
-        f"{name}_median": float(e.median()) for name, e in all_errors.items()
-    }
+    metrics = {f"{name}_mean": float(each.mean()) for name, each in all_errors.items()}
+    for name, each in all_errors.items():
+        metrics[f"{name}_median"] = float(each.median())
+    return metrics

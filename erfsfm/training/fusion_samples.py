@@ -53,17 +53,18 @@ class FusionSamples:
     def __init__(
         self, recordings: Sequence[Recording], networks: DepthPosePredictor, seed: int
     ) -> None:
-        posed = [
-            (r, poses)
-            for r in recordings
-            if r.depth is not None and (poses := r.true_poses()) is not None
-        ]
-        if not posed:
+        self._recordings: list[Recording] = []
+        self._poses: list[NDArray[np.float64]] = []
+        for recording in recordings:
+            poses = None if recording.depth is None else recording.true_poses()
+            if poses is not None:
+                self._recordings.append(recording)
+                self._poses.append(poses)
+        if not self._recordings:
             raise TrainingError(f"no drive has depth maps and poses: {_WANTED}")
-        flat = [r for r, _ in posed if _height(r) < 2 * CROP[0]]
-        if flat:
-            raise TrainingError(f"{flat[0].name} has flatter images: {_WANTED}")
-        self._recordings, self._poses = zip(*posed, strict=True)
+        for recording in self._recordings:
+            if _height(recording) < 2 * CROP[0]:
+                raise TrainingError(f"{recording.name} has flatter images: {_WANTED}")
         self._networks, self._rng = networks, np.random.default_rng(seed)
 
     def draw(self) -> Sample:
@@ -110,10 +111,10 @@ class FusionSamples:
         K = camera.resized(WIDTH, height).K.astype(np.float64)
         channels = evidence(measure(target, guess, others, K, T_neighbour_target))
         is_known = truth > 0
-        wanted, (h, w) = np.log(guess / np.where(is_known, truth, FARTHEST_M)), CROP
-        top, left = (
-            int(rng.integers(have - need + 1)) for have, need in zip(channels.shape[1:], CROP)
-        )
+        wanted = np.log(guess / np.where(is_known, truth, FARTHEST_M))
+        h, w = CROP
+        top = int(rng.integers(channels.shape[1] - h + 1))
+        left = int(rng.integers(channels.shape[2] - w + 1))
         at = slice(2 * top, 2 * (top + h)), slice(2 * left, 2 * (left + w))
         part = channels[:, top : top + h, left : left + w]
         return Sample(part.astype(np.float16), wanted[at].astype(np.float16), is_known[at])

@@ -152,7 +152,9 @@ TABLES: dict[str, Callable[[Sequence[JobResult]], str]] = {
 def notes(results: Sequence[JobResult], definitions: Iterable[MetricDefinition]) -> str:
     """Leaks, reasons of missing numbers, and failed runs, a line each."""
     lines: dict[str, None] = {}
-    for o in (o for o in results if not o.reason):
+    for o in results:
+        if o.reason:
+            continue
         if o.metrics.provenance.leak is True:
             lines[
                 f"LEAK: weights {o.job.weights} saw frames of {o.job.drive.name} in training."
@@ -202,15 +204,8 @@ def with_section(page: str, new: str) -> str:
     sections = {text.splitlines()[0]: text.strip() + "\n" for text in [*old, new]}
     order = [f"## {mode.capitalize()}" for mode in (*TABLES, "speed")]
     place = {title: number for number, title in enumerate(order)}
-    return "\n".join(
-        [
-            PAGE,
-            *(
-                sections[title]
-                for title in sorted(sections, key=lambda t: place.get(t, len(order)))
-            ),
-        ]
-    )
+    titles = sorted(sections, key=lambda title: place.get(title, len(order)))
+    return "\n".join([PAGE, *(sections[title] for title in titles)])
 
 
 def summary_table(results: Sequence[JobResult]) -> str:
@@ -242,15 +237,14 @@ def against_clean(results: Sequence[JobResult]) -> Cell:
     by_run = {key(o.job.drive.name, o): o for o in results}
 
     def cell(group: Sequence[JobResult]) -> str:
-        twins = [
-            (o, by_run[key(o.job.drive.clean, o)])
-            for o in group
-            if key(o.job.drive.clean, o) in by_run
-        ]
-        pairs = [(values([o], m.ATE_7), values([twin], m.ATE_7)) for o, twin in twins]
-        return spread(
-            [ate / clean for [ate], [clean] in (p for p in pairs if all(p)) if clean > 0], 2, max
-        )
+        ratios = []
+        for o in group:
+            twin = by_run.get(key(o.job.drive.clean, o))
+            ate = m.ATE_7.value(o)
+            clean = None if twin is None else m.ATE_7.value(twin)
+            if ate is not None and clean is not None and clean > 0:
+                ratios.append(ate / clean)
+        return spread(ratios, 2, max)
 
     return cell
 

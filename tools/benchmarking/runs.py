@@ -117,12 +117,11 @@ def plan(
     device: str,
 ) -> list[Job]:
     """Every combination, configuration by configuration."""
-    return [
-        Job(folder, drive, each, name, (*overrides, *changes), seed, device)
-        for (name, overrides), seed, each, drive in product(
-            configurations.items(), seeds, weights, drives
-        )
-    ]
+    jobs = []
+    for name, seed, each, drive in product(configurations, seeds, weights, drives):
+        overrides = (*configurations[name], *changes)
+        jobs.append(Job(folder, drive, each, name, overrides, seed, device))
+    return jobs
 
 
 def worlds(

@@ -35,28 +35,33 @@ def in_turn(
                     f"{drive}, {commit}: {runs[commit][-1][COLUMNS[0]]:.1f} ms a frame",
                     file=sys.stderr,
                 )
-        costs[drive] = {
-            commit: {key: median(each.get(key, 0.0) for each in found) for key in found[0]}
-            for commit, found in runs.items()
-        }
+        costs[drive] = {}
+        for commit, found in runs.items():
+            costs[drive][commit] = {
+                key: median(each.get(key, 0.0) for each in found) for key in found[0]
+            }
     return costs
 
 
 def tables(costs: Costs) -> str:
     """Costs and their ratios, then the stages, in Markdown."""
     before, after = next(iter(costs.values()))
-    stages = list(
-        dict.fromkeys(key for pair in costs.values() for cost in pair.values() for key in cost)
-    )
-    stages = stages[len(COLUMNS) :]
-    rows, by_stage = [], []
+    known: dict[str, None] = {}
+    for pair in costs.values():
+        for cost in pair.values():
+            known |= dict.fromkeys(cost)
+    stages = list(known)[len(COLUMNS) :]
+    rows = []
+    by_stage = []
     for drive, pair in costs.items():
-        both = [[cost[key] for cost in pair.values()] for key in COLUMNS]
-        rows.append([drive, *(f"{old:.0f}, {new:.0f}: **{new / old:.2f}**" for old, new in both)])
-        by_stage += [
-            [drive, c, *(f"{cost.get(stage, 0.0):.1f}" for stage in stages)]
-            for c, cost in pair.items()
-        ]
+        row = [drive]
+        for key in COLUMNS:
+            old, new = (cost[key] for cost in pair.values())
+            row.append(f"{old:.0f}, {new:.0f}: **{new / old:.2f}**")
+        rows.append(row)
+        for commit, cost in pair.items():
+            times = [f"{cost.get(stage, 0.0):.1f}" for stage in stages]
+            by_stage.append([drive, commit, *times])
     return f"""Medians of {before}, of {after}: and their ratio.
 
 {Table(["drive", *COLUMNS], rows).markdown()}

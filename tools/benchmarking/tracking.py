@@ -51,7 +51,8 @@ def longest_wait(o: JobResult) -> int | None:
         return None
     lost = [each.frame for each in events if each.event == "lost"]
     found = [each.frame for each in events if each.event in ("map begun", "relocalised")]
-    waits = [
-        min((frame for frame in found if frame > start), default=frames) - start for start in lost
-    ]
+    waits = []
+    for start in lost:
+        later = [frame for frame in found if frame > start]
+        waits.append(min(later, default=frames) - start)
     return max(waits, default=None)

@@ -212,8 +212,9 @@ def evaluate_depth(
 
     Example: erfsfm evaluate depth --weights default --weights sim --dataset worlds --dataset KITTI_RAW --output d.json
     """
+    from erfsfm.data.discovery import named_recordings
+    from erfsfm.evaluation.depth_protocols import depth_protocol, many_view_protocol
     from erfsfm.evaluation.eigen import eigen_protocol
-    from erfsfm.evaluation.protocols import depth_protocol, many_view_protocol, named_recordings
     from erfsfm.inference import DepthPosePredictor
 
     if truth == "many-views" and split is not None:
@@ -294,7 +295,7 @@ def evaluate_pose(
 
     Example: erfsfm evaluate pose --weights default --dataset KITTI --sequence 09 --sequence 10
     """
-    from erfsfm.evaluation.protocols import pose_protocol
+    from erfsfm.evaluation.pose_protocols import pose_protocol
     from erfsfm.inference import DepthPosePredictor
 
     predictor = DepthPosePredictor.from_weights(weights, device)

@@ -18,6 +18,8 @@ from torch import Tensor
 from erfsfm.common.readers.camera_file import Pinhole
 from erfsfm.config import Fidelity
 
+MINIMUM_Z = 1e-3
+
 
 @dataclass(frozen=True)
 class Camera(Pinhole):
@@ -148,9 +150,6 @@ def pose_vector_to_matrix(pose_vec_trans_euler: Tensor) -> Tensor:
     top = torch.cat([euler_to_rotation(euler), translation.unsqueeze(-1)], dim=-1)  # (..., 3, 4)
     none = torch.zeros_like(top[..., :1, :])
     return torch.cat([top, torch.cat([none[..., :3], none[..., 3:] + 1], dim=-1)], dim=-2)
-
-
-MINIMUM_Z = 1e-3
 
 
 def project_into_source(depth: Tensor, T_source_target: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:

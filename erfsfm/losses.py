@@ -11,6 +11,16 @@ from torch import Tensor
 
 C1, C2 = 0.01**2, 0.03**2
 
+MAX_BOUND_RATIO = 1.5  # most over least
+FARTHEST = 100.0  # camera heights: weights do not grow beyond
+STEPS_PX = (1, 2, 4, 8)
+LEAST_HALF_WIDTH = 1e-3  # of bounds, log inverse depth: those of exact depth have none
+STILL = 0.01  # network units: added to the length of a step, against division by zero
+
+
+Bounds = tuple[Tensor, Tensor]
+"""Least and most inverse depth ``(B, 1, H, W)`` as measured: 0 where unbounded from below, infinite from above."""
+
 
 class BoxMean(torch.autograd.Function):
     """Mean over each 3 x 3 window, as ``avg_pool2d(x, 3, 1)``, by separable additions.
@@ -117,17 +127,6 @@ def edge_aware_smoothness(values: Tensor, image: Tensor) -> Tensor:
     return (_dx(normalised).abs() * weight_x).mean() + (_dy(normalised).abs() * weight_y).mean()
 
 
-MAX_BOUND_RATIO = 1.5  # most over least
-FARTHEST = 100.0  # camera heights: weights do not grow beyond
-STEPS_PX = (1, 2, 4, 8)
-LEAST_HALF_WIDTH = 1e-3  # of bounds, log inverse depth: those of exact depth have none
-STILL = 0.01  # network units: added to the length of a step, against division by zero
-
-
-Bounds = tuple[Tensor, Tensor]
-"""Least and most inverse depth ``(B, 1, H, W)`` as measured: 0 where unbounded from below, infinite from above."""
-
-
 def enlarged(disparity: Tensor, level: int, size: tuple[int, int]) -> Tensor:
     """Disparity ``(B, 1, h, w)`` of a pyramid level at the full size (height, width): ``(B, 1, H, W)``.
 
@@ -154,7 +153,8 @@ def disagreement(disparity: Tensor, bounds: Bounds, log_scale: float) -> Tensor:
     """
     has_least, has_most = bounds[0] > 0, torch.isfinite(bounds[1])
     scaled = disparity.log() - log_scale
-    least, most = (bound.clamp(min=1e-6).log() for bound in bounds)
+    least = bounds[0].clamp(min=1e-6).log()
+    most = bounds[1].clamp(min=1e-6).log()
     both = has_least & has_most
     middle = torch.where(both, (least + most) / 2, 0)
     half = torch.where(both, (most - least) / 2, 1).clamp(min=LEAST_HALF_WIDTH)
@@ -185,13 +185,10 @@ def step_disagreement(disparity: Tensor, bounds: Bounds) -> Tensor:
     for apart in STEPS_PX:
         for axis in (2, 3):
             length = max(error.shape[axis] - apart, 0)
-            first, second = (values.narrow(axis, 0, length) for values in (error, narrow))
-            first_on, second_on = (
-                values.narrow(axis, error.shape[axis] - length, length)
-                for values in (error, narrow)
-            )
-            both = second & second_on
-            total = total + ((first_on - first).abs() * both).sum() / both.sum().clamp(min=1)
+            start = error.shape[axis] - length
+            both = narrow.narrow(axis, 0, length) & narrow.narrow(axis, start, length)
+            step = error.narrow(axis, start, length) - error.narrow(axis, 0, length)
+            total = total + (step.abs() * both).sum() / both.sum().clamp(min=1)
     return total / (2 * len(STEPS_PX))
 
 

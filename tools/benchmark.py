@@ -23,13 +23,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
-from benchmarking import handheld, page
+from benchmarking import handheld, page, speed
 from benchmarking import runs as p
 from benchmarking.metrics import rows
 from shared.command import one_line_errors, parser_of
 
 from erfsfm.common.files import write_atomically
 from erfsfm.common.table import csv_of
+
+Add = Callable[..., object]  # adds an option to a mode, as `add_argument` does
+_BOTH = ("loop", "straight")
+# options of paths, which the page calls by these names
+_PATHS = ("report", "kitti", "data", *handheld.ROOTS, "output", "worlds_in", "against")
 
 
 @dataclass(frozen=True)
@@ -44,9 +49,6 @@ class Mode:
     seeds: tuple[int, ...] = (0,)
 
 
-_BOTH = ("loop", "straight")
-# options of paths, which the page calls by these names
-_PATHS = ("report", "kitti", "data", *handheld.ROOTS, "output", "worlds_in", "against")
 MODES = {
     "accuracy": Mode(
         "errors of all trajectories", p.ACCURACY, _BOTH, (610, 611), ("default", "sim"), (0, 1, 2)
@@ -125,7 +127,7 @@ def _compare_speed(options: argparse.Namespace, command: str) -> None:
     runs.mkdir(parents=True)
     checkouts = zip(("before", "after"), (options.against.resolve(), p.ROOT))
     named = {f"{when} ({p.revision(checkout)})": checkout for when, checkout in checkouts}
-    text = p.tables(p.in_turn(named, drives, options.pairs, runs))
+    text = speed.tables(speed.in_turn(named, drives, options.pairs, runs))
     _write_section(options, page.speed_section(command, text))
     print(text)
 
@@ -146,9 +148,8 @@ def _jobs(options: argparse.Namespace) -> list[p.Job]:
     if getattr(options, "kitti", None) is not None:
         drives += p.recordings(options.kitti.resolve(), options.sequences, options.excerpt)
     if getattr(options, "data", None) is not None:
-        drives += [
-            d for root in p.ORIGINALS for d in p.recordings(options.data.resolve() / root, (), None)
-        ]
+        for root in p.ORIGINALS:
+            drives += p.recordings(options.data.resolve() / root, (), None)
     configurations = MODES[options.mode].configurations
     parts = getattr(options, "parts", None)
     if parts is not None:
@@ -161,100 +162,110 @@ def _jobs(options: argparse.Namespace) -> list[p.Job]:
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of(__doc__)
     modes = parser.add_subparsers(dest="mode", required=True, metavar="|".join([*MODES, "speed"]))
-
-    def options_of(name: str, what: str) -> Callable[..., object]:
-        show = argparse.ArgumentDefaultsHelpFormatter
-        add = modes.add_parser(name, help=what, description=what, formatter_class=show).add_argument
-        add(
-            "--output",
-            type=Path,
-            default=Path("runs/benchmark"),
-            help="keeps runs, worlds and CSV files",
-        )
-        add(
-            "--report",
-            type=Path,
-            default=Path("docs/benchmarks.md"),
-            help="the page whose section is written",
-        )
-        return add
-
     for name, mode in MODES.items():
-        add = options_of(name, mode.what)
-        if name == "full-size":
-            data = os.environ.get("ERFSFM_DATA")
-            add(
-                "--data",
-                type=Path,
-                default=data and Path(data),
-                metavar="FOLDER",
-                help="recordings; $ERFSFM_DATA",
-            )
-        elif name != "handheld":
-            add("--kitti", type=Path, metavar="ROOT", help="a KITTI odometry root to measure")
-            add(
-                "--sequences",
-                nargs="+",
-                default=(),
-                metavar="NAME",
-                help="of that root; all of them without it",
-            )
+        add = _options_of(modes.add_parser, name, mode.what)
+        _add_recordings(add, name)
         if name == "handheld":
             handheld.add_options(add)
         else:
-            add("--routes", nargs="*", default=mode.routes, help="of simulated worlds")
-            add("--worlds", nargs="+", type=int, default=mode.worlds, help="their seeds")
-            add("--frames", type=int, default=300, help="their length")
-            add(
-                "--conditions",
-                nargs="+",
-                choices=get_args(p.Condition),
-                default=["clean"],
-                help="hazards: all at once",
-            )
-        add(
-            "--worlds-in",
-            type=Path,
-            metavar="FOLDER",
-            help="where they are or will be; OUTPUT/worlds without it",
-        )
-        add("--weights", nargs="+", default=mode.weights, help="names or folders")
-        add("--seeds", nargs="+", type=int, default=mode.seeds, help="of the RANSAC draws")
-        add(
-            "--set",
-            nargs="+",
-            default=(),
-            metavar="KEY=VALUE",
-            help="changes to every configuration",
-        )
-        add(
-            "--device",
-            choices=("auto", "cpu", "cuda"),
-            default="cpu",
-            help="where the networks compute",
-        )
+            _add_worlds(add, mode)
+        _add_runs(add, mode)
         if name in ("accuracy", "maps"):
             add("--excerpt", metavar="A:B", help="frames of the sequences of --kitti, half-open")
         if name == "maps":
-            add(
-                "--drives",
-                nargs="+",
-                type=Path,
-                default=(),
-                metavar="FOLDER",
-                help="KITTI raw drives",
-            )
-            parts = [part for part in mode.configurations if part != p.EVERYTHING]
-            add(
-                "--parts",
-                nargs="*",
-                choices=parts,
-                metavar="PART",
-                help=f"to turn off: {', '.join(parts)}; else all",
-            )
+            _add_parts(add, mode)
         add("--jobs", type=int, default=1, help="runs at a time; more than one needs Dask")
         add("--scheduler", metavar="ADDRESS", help="of a Dask cluster in place of local processes")
-    add = options_of("speed", "time, memory and stages of two checkouts in turn")
+    what = "time, memory and stages of two checkouts in turn"
+    _add_checkouts(_options_of(modes.add_parser, "speed", what))
+    return parser
+
+
+def _options_of(add_parser: Callable[..., argparse.ArgumentParser], name: str, what: str) -> Add:
+    """The function that adds an option to a new mode; what every mode writes is there already."""
+    show = argparse.ArgumentDefaultsHelpFormatter
+    add = add_parser(name, help=what, description=what, formatter_class=show).add_argument
+    add(
+        "--output",
+        type=Path,
+        default=Path("runs/benchmark"),
+        help="keeps runs, worlds and CSV files",
+    )
+    add(
+        "--report",
+        type=Path,
+        default=Path("docs/benchmarks.md"),
+        help="the page whose section is written",
+    )
+    return add
+
+
+def _add_recordings(add: Add, mode: str) -> None:
+    if mode == "full-size":
+        data = os.environ.get("ERFSFM_DATA")
+        add(
+            "--data",
+            type=Path,
+            default=data and Path(data),
+            metavar="FOLDER",
+            help="recordings; $ERFSFM_DATA",
+        )
+    elif mode != "handheld":
+        add("--kitti", type=Path, metavar="ROOT", help="a KITTI odometry root to measure")
+        add(
+            "--sequences",
+            nargs="+",
+            default=(),
+            metavar="NAME",
+            help="of that root; all of them without it",
+        )
+
+
+def _add_worlds(add: Add, mode: Mode) -> None:
+    add("--routes", nargs="*", default=mode.routes, help="of simulated worlds")
+    add("--worlds", nargs="+", type=int, default=mode.worlds, help="their seeds")
+    add("--frames", type=int, default=300, help="their length")
+    add(
+        "--conditions",
+        nargs="+",
+        choices=get_args(p.Condition),
+        default=["clean"],
+        help="hazards: all at once",
+    )
+
+
+def _add_runs(add: Add, mode: Mode) -> None:
+    add(
+        "--worlds-in",
+        type=Path,
+        metavar="FOLDER",
+        help="where they are or will be; OUTPUT/worlds without it",
+    )
+    add("--weights", nargs="+", default=mode.weights, help="names or folders")
+    add("--seeds", nargs="+", type=int, default=mode.seeds, help="of the RANSAC draws")
+    add("--set", nargs="+", default=(), metavar="KEY=VALUE", help="changes to every configuration")
+    add(
+        "--device",
+        choices=("auto", "cpu", "cuda"),
+        default="cpu",
+        help="where the networks compute",
+    )
+
+
+def _add_parts(add: Add, mode: Mode) -> None:
+    add("--drives", nargs="+", type=Path, default=(), metavar="FOLDER", help="KITTI raw drives")
+    parts = list(mode.configurations)
+    parts.remove(p.EVERYTHING)
+    add(
+        "--parts",
+        nargs="*",
+        choices=parts,
+        metavar="PART",
+        help=f"to turn off: {', '.join(parts)}; else all",
+    )
+
+
+def _add_checkouts(add: Add) -> None:
     add(
         "--against",
         type=Path,
@@ -272,7 +283,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--folders", nargs="*", type=Path, default=(), metavar="FOLDER", help="folders of images")
     add("--frames", type=int, default=2000, help="of a simulated grid; 0 leaves it out")
     add("--pairs", type=int, default=3, help="runs of each drive by each checkout")
-    return parser
 
 
 if __name__ == "__main__":

@@ -55,14 +55,13 @@ _DASHES = {"dash": "dashed", "dot": "dotted"}
 def main() -> None:
     """One picture: depth of some frames above trajectories and map, or frames above the map as they see it."""
     parser = parser_of(__doc__)
-    parser.add_argument("run", type=Path)
-    parser.add_argument("output", type=Path)
-    parser.add_argument("--dataset", type=Path, help="of the run; default: the embedded sequence")
-    parser.add_argument("--sequence")
-    parser.add_argument("--weights", default="default")
-    parser.add_argument(
-        "--seat", type=int, nargs="+", metavar="FRAME", help="the map as these see it, below them"
-    )
+    add = parser.add_argument
+    add("run", type=Path)
+    add("output", type=Path)
+    add("--dataset", type=Path, help="of the run; default: the embedded sequence")
+    add("--sequence")
+    add("--weights", default="default")
+    add("--seat", type=int, nargs="+", metavar="FRAME", help="the map as these see it, below them")
     arguments = parser.parse_args()
 
     folder = RunFolder.open(arguments.run)

@@ -8,6 +8,7 @@ Example: python tools/reproduce.py --kitti KITTI_ODOMETRY --raw KITTI_RAW --rows
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import re
@@ -28,13 +29,14 @@ from erfsfm.common.files import write_atomically
 from erfsfm.common.progress import Progress, duration, progress_bar, silent
 from erfsfm.common.table import Table
 from erfsfm.config import ExperimentConfig, load_experiment
+from erfsfm.data.discovery import named_recordings
 from erfsfm.data.prepared import write_prepared
 from erfsfm.data.split import split_recordings
 from erfsfm.evaluation.eigen import eigen_protocol, read_split
-from erfsfm.evaluation.protocols import named_recordings, pose_protocol
+from erfsfm.evaluation.pose_protocols import pose_protocol
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.model_record import read_record
-from erfsfm.training.keeper import OutputFolder
+from erfsfm.training.output_folder import OutputFolder
 from erfsfm.training.run import prepare, train
 
 GUIDE = Path(__file__).parents[1] / "docs" / "design" / "reproduction.md"
@@ -131,11 +133,11 @@ def _changed(config: ExperimentConfig, section: str, **values: Any) -> Experimen
 def ours(row: Row, results: Results) -> list[str]:
     """Our figures in the columns of the paper; a dash where there is none."""
     if not row.scale:
-        networks = [each for each in results.get("pose", []) if each["method"] == "networks"]
-        pairs = [
-            (each[f"{key}_mean"], each[f"{key}_std"]) for each in networks for key in ("ate", "re")
-        ]
-        figures = [f"{mean:.4f} ± {deviation:.4f}" for mean, deviation in pairs]
+        figures = []
+        for each in results.get("pose", []):
+            if each["method"] == "networks":
+                for key in ("ate", "re"):
+                    figures.append(f"{each[f'{key}_mean']:.4f} ± {each[f'{key}_std']:.4f}")
     else:
         scaling = {"GT": "gt-median", "PoseNet": "pose"}[row.scale]
         depth = next((each for each in results.get("depth", []) if each["scaling"] == scaling), {})
@@ -188,9 +190,7 @@ def _require_tested(kitti: Path, raw: Path | None, split: str) -> None:
         frame.image_path()
 
 
-@one_line_errors()
-def main(words: Sequence[str] | None = None) -> None:
-    """Train what is missing, evaluate, write the tables after every training."""
+def _parser() -> argparse.ArgumentParser:
     parser = parser_of(__doc__)
     add = parser.add_argument
     add(
@@ -233,7 +233,13 @@ def main(words: Sequence[str] | None = None) -> None:
         default="auto",
         help="where the networks compute",
     )
-    options = parser.parse_args(words)
+    return parser
+
+
+@one_line_errors()
+def main(words: Sequence[str] | None = None) -> None:
+    """Train what is missing, evaluate, write the tables after every training."""
+    options = _parser().parse_args(words)
     workers = min(max((os.cpu_count() or 2) - 1, 1), 8)
     changes = [f"data.workers={workers}", f"data.cache_mb={8000 // workers}", *options.set]
     rows = paper_rows(options.rows)

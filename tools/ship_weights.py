@@ -45,23 +45,18 @@ Measured (`{evaluation}`):
 def main() -> None:
     """Write ``erfsfm/weights/NAME``."""
     parser = parser_of(__doc__)
-    parser.add_argument("run", type=Path, help="output folder of erfsfm train")
-    parser.add_argument("name", help="name of the shipped weights")
-    parser.add_argument(
+    add = parser.add_argument
+    add("run", type=Path, help="output folder of erfsfm train")
+    add("name", help="name of the shipped weights")
+    add(
         "--mean-with", action="append", default=[], help="weights to average with the run's; repeat"
     )
-    parser.add_argument("--data", required=True, help="one line: what it was trained on")
-    parser.add_argument(
-        "--held-out", default="simulated seeds 500-599", help="one line: what it never saw"
-    )
-    parser.add_argument(
-        "--command", help="in place of the recorded one, without the paths of one machine"
-    )
-    parser.add_argument(
-        "--note", required=True, help="a paragraph for the card: what taught each network, and how"
-    )
-    parser.add_argument("--metrics", type=Path, help="output of erfsfm evaluate ... --json")
-    parser.add_argument(
+    add("--data", required=True, help="one line: what it was trained on")
+    add("--held-out", default="simulated seeds 500-599", help="one line: what it never saw")
+    add("--command", help="in place of the recorded one, without the paths of one machine")
+    add("--note", required=True, help="a paragraph for the card: what taught each network, and how")
+    add("--metrics", type=Path, help="output of erfsfm evaluate ... --json")
+    add(
         "--evaluation",
         default="validation of the training run",
         help="the command behind --metrics",

@@ -164,7 +164,7 @@ CHANGES: dict[str, Callable[[Drive], Drive]] = {
     "mirrored images": in_between(lambda image, _: image[:, ::-1].copy()),
     "darkness": in_between(partial(_noisy, gain=0.01, sigma=1.0), 0.3),
     "doubled frames": lambda d: d.rows(
-        [k for k in range(len(d.images)) for _ in range(2 if k % 40 == 20 else 1)]
+        sorted([*range(len(d.images)), *range(20, len(d.images), 40)])
     ),
     "stamps out of order": lambda d: replace(
         d, stamps=d.stamps[[0, 2, 1, *range(3, len(d.stamps))]]
@@ -300,18 +300,15 @@ def judge_confidence(runs: Path) -> None:
 def main(words: Sequence[str] | None = None) -> None:
     """Run all drives and print a row of a table each."""
     parser = parser_of(__doc__)
-    parser.add_argument(
-        "--dataset", type=Path, help="a data set with true poses; else simulated worlds"
-    )
-    parser.add_argument("--sequence")
-    parser.add_argument("--frames", help="A:B, half-open")
-    parser.add_argument("--seeds", help="A:B, of simulated worlds", default="840:846")
-    parser.add_argument(
-        "--change", action="append", choices=list(CHANGES), help="default: every one; repeat"
-    )
-    parser.add_argument("--weights", default="default")
-    parser.add_argument("--keep", type=Path, help="folder for the run folders")
-    parser.add_argument(
+    add = parser.add_argument
+    add("--dataset", type=Path, help="a data set with true poses; else simulated worlds")
+    add("--sequence")
+    add("--frames", help="A:B, half-open")
+    add("--seeds", help="A:B, of simulated worlds", default="840:846")
+    add("--change", action="append", choices=list(CHANGES), help="default: every one; repeat")
+    add("--weights", default="default")
+    add("--keep", type=Path, help="folder for the run folders")
+    add(
         "--fit",
         type=Path,
         metavar="RUNS",

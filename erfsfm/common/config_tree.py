@@ -15,6 +15,7 @@ from erfsfm.common.errors import ConfigError, ErfsfmError
 from erfsfm.common.files import read_text
 
 M = TypeVar("M", bound=BaseModel)
+MAX_BYTES = 2**18
 
 
 class Section(BaseModel):
@@ -56,21 +57,19 @@ def find_config(file_or_name: str | Path, shipped: Sequence[Path]) -> Path:
     path = Path(file_or_name)
     if path.is_file():
         return path
-    known = {
-        file.stem: file for folder in reversed(shipped) for file in sorted(folder.glob("*.yaml"))
-    }
+    known: dict[str, Path] = {}
+    for folder in reversed(shipped):
+        for file in sorted(folder.glob("*.yaml")):
+            known[file.stem] = file
     if str(file_or_name) in known:
         return known[str(file_or_name)]
     if path.is_dir():
         raise ConfigError(f"configuration '{file_or_name}' is a folder, not a YAML file")
     nearest = difflib.get_close_matches(path.stem, known, 1)
     hint = f"; did you mean '{nearest[0]}'?" if nearest else ""
-    begun = [
-        name for name in sorted(known) if name.startswith(path.stem)
-    ]  # "table1" is the beginning of many
-    names = ", ".join(
-        begun or (name for name in sorted(known) if "-" not in name)
-    )  # variants have a dash
+    begun = [name for name in sorted(known) if name.startswith(path.stem)]  # "table1" begins many
+    without_variants = [name for name in sorted(known) if "-" not in name]
+    names = ", ".join(begun or without_variants)
     raise ConfigError(
         f"no configuration file or name '{file_or_name}' (known names: {names or 'none'}){hint}"
     )
@@ -111,7 +110,7 @@ def dump_explained(config: BaseModel) -> str:
 def first_problem(error: ValidationError) -> str:
     """The first problem of a validation error as ``key: problem``, for small files that have no overrides."""
     first = error.errors(include_url=False)[0]
-    place = ".".join(str(part) for part in first["loc"])
+    place = ".".join(map(str, first["loc"]))
     in_short = {"missing": "missing", "extra_forbidden": "unknown key"}
     said = in_short.get(first["type"], first["msg"].removeprefix("Value error, "))
     return f"{place}: {said}" if place else said
@@ -139,7 +138,7 @@ def _one_line(
 ) -> str:
     first = error.errors(include_url=False)[0]
     known = list(_known_keys(model))
-    place = ".".join(str(part) for part in first["loc"])
+    place = ".".join(map(str, first["loc"]))
     origin = _origin(place, origin, overrides)
     if first["type"] == "extra_forbidden":
         return f"unknown key '{place}' in {origin}; {_nearest_key(place, known)}"
@@ -170,9 +169,9 @@ def _origin(place: str, origin: str, overrides: Sequence[str]) -> str:
 def _nearest_key(key: str, known: Sequence[str]) -> str:
     section, _, last = key.rpartition(".")
     siblings = [name for name in known if name.rpartition(".")[0] == section]
-    last_words = {
-        name.rpartition(".")[2]: name for name in (*reversed(known), *siblings)
-    }  # siblings first
+    last_words = {}
+    for name in (*reversed(known), *siblings):  # siblings first
+        last_words[name.rpartition(".")[2]] = name
     if nearest := difflib.get_close_matches(last, last_words, 1, 0.7):
         return f"did you mean '{last_words[nearest[0]]}'?"
     return f"known keys{f' of {section}' if section else ''}: {', '.join(siblings)}"
@@ -188,9 +187,6 @@ def _known_keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
 def _shown(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 80 else f"{text[:77]}..."
-
-
-MAX_BYTES = 2**18
 
 
 class YamlError(ConfigError):

@@ -29,6 +29,12 @@ _POLL_S = 0.5
 _GIB = 2**30
 _MOST_SAID = 20_000  # bytes of its standard error that are searched for the reason
 
+S = TypeVar("S")
+T = TypeVar("T")
+
+CORES = 2  # used side by side
+_FATAL = 4  # level of ONNX Runtime's own log; its errors are raised as well
+
 
 @contextmanager
 def processes(work: str) -> Iterator[ProcessPoolExecutor]:
@@ -113,13 +119,6 @@ def _watch(process: subprocess.Popen[bytes], memory_gib: float) -> str:
                 used = pages * os.sysconf("SC_PAGE_SIZE") / _GIB
             if 0 < memory_gib < used:
                 return f"it used {used:.1f} GiB of memory, more than the {memory_gib:.1f} GiB of --memory"
-
-
-S = TypeVar("S")
-T = TypeVar("T")
-
-CORES = 2  # used side by side
-_FATAL = 4  # level of ONNX Runtime's own log; its errors are raised as well
 
 
 def usable_cores() -> int:

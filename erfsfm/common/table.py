@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
+from itertools import chain
 from typing import Any
 
 DASH = "–"
@@ -48,7 +49,7 @@ class Table:
                 header, justify="left" if column < self.names else "right", overflow="fold"
             )
         for row in self.rows:
-            cells = [Text(text) for text in row]
+            cells = list(map(Text, row))
             for cell in cells:
                 cell.highlight_words(_WARNINGS, "bold red")
             table.add_row(*cells)
@@ -76,22 +77,24 @@ class Table:
 
 def table_of(rows: Sequence[dict[str, Any]]) -> Table:
     """Records as a table whose head are their keys."""
-    keys = list(dict.fromkeys(key for row in rows for key in row))
-    names = next(
-        (
-            k
-            for k, key in enumerate(keys)
-            if any(isinstance(row.get(key), float | int) for row in rows)
-        ),
-        1,
-    )
-    return Table(keys, [[_written(row.get(key)) for key in keys] for row in rows], names=names)
+    keys = list(dict.fromkeys(chain.from_iterable(rows)))
+    names = 0
+    while names < len(keys) and not _has_numbers(rows, keys[names]):
+        names += 1
+    cells = []
+    for row in rows:
+        cells.append([_written(row.get(key)) for key in keys])
+    return Table(keys, cells, names=names if names < len(keys) else 1)
+
+
+def _has_numbers(rows: Sequence[dict[str, Any]], key: str) -> bool:
+    return any(isinstance(row.get(key), float | int) for row in rows)
 
 
 def csv_of(rows: Iterable[dict[str, Any]]) -> str:
     """Records as CSV, a header with all keys first; None is empty."""
     records, text = list(rows), io.StringIO()
-    writer = csv.DictWriter(text, list(dict.fromkeys(key for record in records for key in record)))
+    writer = csv.DictWriter(text, list(dict.fromkeys(chain.from_iterable(records))))
     writer.writeheader()
     writer.writerows(records)
     return text.getvalue()
@@ -104,7 +107,8 @@ def _written(value: Any) -> str:
 
 
 def _html_row(cells: Sequence[str], tag: str) -> str:
-    texts = (
-        cell if hasattr(cell, "__html__") else escape(cell).replace("\n", "<br>") for cell in cells
-    )
-    return f"<tr>{''.join(f'<{tag}>{text}</{tag}>' for text in texts)}</tr>"
+    row = ""
+    for cell in cells:
+        text = cell if hasattr(cell, "__html__") else escape(cell).replace("\n", "<br>")
+        row += f"<{tag}>{text}</{tag}>"
+    return f"<tr>{row}</tr>"

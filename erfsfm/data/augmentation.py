@@ -21,6 +21,10 @@ Pictures = list[NDArray[np.float32]]  # colour in [0, 1]
 _EACH = 0.6  # chance of each weather
 _BLUR_SAMPLES = 6  # images averaged into a blurred one
 
+# An image does not show its focal length. Under a teacher lengths are those of a camera of this
+# focal length, in image heights (KITTI's), so that cameras and random crops agree (Yin et al. 2023, Metric3D).
+FOCAL_LENGTH = 1.9
+
 
 def augment(
     images: Images,
@@ -69,8 +73,9 @@ def rolled(
     turned = cv2.warpAffine(
         image, move, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
     )
-    nearest = [
-        cv2.warpAffine(
+    nearest = []
+    for values, value in zip(maps, unknown, strict=True):
+        moved = cv2.warpAffine(
             values,
             move,
             size,
@@ -78,8 +83,7 @@ def rolled(
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=value,
         )
-        for values, value in zip(maps, unknown, strict=True)
-    ]
+        nearest.append(moved)
     return np.asarray(turned, np.uint8), nearest
 
 
@@ -99,14 +103,14 @@ def _scale_crop(
     left = int(rng.integers(size[0] - width + 1))
     top = int(rng.integers(size[1] - height + 1))
     part = slice(top, top + height), slice(left, left + width)
-    crops = [
-        np.ascontiguousarray(cv2.resize(i, size, interpolation=cv2.INTER_LINEAR)[part])
-        for i in images
-    ]
-    moved = [
-        np.ascontiguousarray(cv2.resize(m, size, interpolation=cv2.INTER_NEAREST_EXACT)[part])
-        for m in maps
-    ]
+    crops = []
+    for image in images:
+        larger = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
+        crops.append(np.ascontiguousarray(larger[part]))
+    moved = []
+    for values in maps:
+        larger = cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT)
+        moved.append(np.ascontiguousarray(larger[part]))
     return crops, moved, enlarged.cropped(left, top, width, height)
 
 
@@ -190,25 +194,22 @@ def _blurred(images: Pictures, rng: np.random.Generator) -> Pictures:
         shift = (1 - zoom) * centre + time * np.array([yaw, rise])
         moves.append(np.array([[zoom, 0, shift[0]], [0, zoom, shift[1]]]))
     border = cv2.BORDER_REPLICATE
-    blurred = [
-        np.mean(
-            [cv2.warpAffine(image, move, (width, height), borderMode=border) for move in moves],
-            axis=0,
-        )
-        for image in images
-    ]
-    return [np.asarray(image, dtype=np.float32) for image in blurred]
+    blurred = []
+    for image in images:
+        moved = [cv2.warpAffine(image, move, (width, height), borderMode=border) for move in moves]
+        blurred.append(np.asarray(np.mean(moved, axis=0), dtype=np.float32))
+    return blurred
 
 
 def _exposed(images: Pictures, rng: np.random.Generator) -> Pictures:
     """A random gain and gamma, with a jump at a random frame."""
     jump = int(rng.integers(len(images) + 1))
-    before, after = ((float(rng.uniform(0.5, 1.6)), float(rng.uniform(0.7, 1.4))) for _ in range(2))
-    chosen = [before if k < jump else after for k in range(len(images))]
-    return [
-        np.float32(gain) * np.power(image, np.float32(gamma))
-        for image, (gain, gamma) in zip(images, chosen)
-    ]
+    gains_and_gammas = rng.uniform((0.5, 0.7), (1.6, 1.4), (2, 2)).astype(np.float32)
+    exposed = []
+    for number, image in enumerate(images):
+        gain, gamma = gains_and_gammas[int(number >= jump)]
+        exposed.append(gain * np.power(image, gamma))
+    return exposed
 
 
 def _rained_on(images: Pictures, rng: np.random.Generator) -> Pictures:
@@ -230,11 +231,6 @@ def _rained_on(images: Pictures, rng: np.random.Generator) -> Pictures:
         hazy = image + np.float32(veil) * (np.float32(grey) - image)
         wet.append(hazy + cover * (np.float32(0.9) - hazy))
     return wet
-
-
-# An image does not show its focal length. Under a teacher lengths are those of a camera of this
-# focal length, in image heights (KITTI's), so that cameras and random crops agree (Yin et al. 2023, Metric3D).
-FOCAL_LENGTH = 1.9
 
 
 def training_sample(

@@ -14,6 +14,7 @@ from typing import TypeVar
 
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import CAMERA_FILE, read_camera_file
+from erfsfm.common.readers.frame_range import EVERYTHING, FrameRange
 from erfsfm.common.readers.images import (
     first_size,
     has_images,
@@ -58,7 +59,8 @@ def discover(root: Path) -> list[Recording]:
     if not found and root.is_dir():
         visible = (p for p in root.iterdir() if not p.name.startswith("."))
         children = sorted(p for p in visible if p.is_dir() or p.suffix.lower() in VIDEO_SUFFIXES)
-        found = [r for child in children for r in _recordings_at(child)]
+        for child in children:
+            found += _recordings_at(child)
     if not found:
         entries = (
             ", ".join(sorted(p.name for p in root.iterdir())[:8]) if root.is_dir() else root.name
@@ -72,21 +74,58 @@ def discover(root: Path) -> list[Recording]:
     return found
 
 
+def named_recordings(root: Path, name: str) -> list[Recording]:
+    """Recordings of a sequence, or their part that a name with frames means (``00[250:300]``); of its first camera.
+
+    Without a name they are all recordings of the root.
+    """
+    if not name:
+        return discover(root)
+    found: dict[str, list[Recording]] = {}
+    for each in discover(root):
+        for known in {each.name, each.sequence or each.name}:
+            found.setdefault(known, []).append(each)
+    span = FrameRange(name, 0, EVERYTHING) if name in found else FrameRange.parse(name)
+    if span.recording not in found:
+        raise DataError(
+            f"no sequence {span.recording} in {root}: found {', '.join(sorted(found)) or 'none'}"
+        )
+    camera = found[span.recording][0].images[0].parent
+    known_frames: list[str] = []
+    chosen: list[Recording] = []
+    for whole in found[span.recording]:
+        if whole.images[0].parent == camera:
+            known_frames.append(whole.frames_name)
+            part = whole.within(span.start, span.stop)
+            chosen += [] if part is None else [part]
+    if not chosen:
+        raise DataError(f"{name} names no frame of a recording: found {', '.join(known_frames)}")
+    return chosen
+
+
 def _recordings_at(root: Path) -> list[Recording]:
     if (root / INDEX_FILE).is_file():
         return read_prepared(root)
     odometry = find_odometry_root(root)
     if odometry is not None:
-        return [r for folder in sorted(odometry.folders()) for r in _odometry(odometry, folder)]
-    drives = find_drives(root)
-    if drives:
-        return [recording for drive in drives.values() for recording in open_drive(drive)]
+        found = []
+        for folder in sorted(odometry.folders()):
+            found += _odometry(odometry, folder)
+        return found
+    if drives := find_drives(root):
+        found = []
+        for drive in drives.values():
+            found += open_drive(drive)
+        return found
     return _own(root)
 
 
 def _odometry(root: OdometryRoot, sequence: Path) -> list[Recording]:
     """The cameras of a sequence in parts without gaps."""
-    folders = {c: folder for c in ODOMETRY_CAMERAS if (folder := sequence / f"image_{c}").is_dir()}
+    folders: dict[int, Path] = {}
+    for camera in ODOMETRY_CAMERAS:
+        if (folder := sequence / f"image_{camera}").is_dir():
+            folders[camera] = folder
     poses, written = root.base / "poses" / f"{sequence.name}.txt", root.base / CAMERA_FILE
     height_m: float | None = (
         None  # of the camera in a simulated world, in rooms a constant; unknown in a real root
@@ -98,13 +137,13 @@ def _odometry(root: OdometryRoot, sequence: Path) -> list[Recording]:
         calibration, row = CalibrationFile(sequence / ODOMETRY_CALIBRATION), f"P{camera}"
         pinhole = calibration.pinhole(row, width, height)
         depth = tuple(sequence / "depth_2" / f"{image.stem}.png" for image in files.paths)
-        tx, ty, tz = (float(value) for value in calibration.T_camera_cam0(row)[:3, 3])
+        tx, ty, tz = map(float, calibration.T_camera_cam0(row)[:3, 3])
         whole = Recording(
             root.recording_name(sequence.name),
             files.paths,
             Camera.of(pinhole),
             depth=depth
-            if camera == ODOMETRY_CAMERAS[0] and all(path.is_file() for path in depth)
+            if camera == ODOMETRY_CAMERAS[0] and all(map(Path.is_file, depth))
             else None,
             poses_file=poses if poses.is_file() else None,
             camera_height_m=height_m,
@@ -119,9 +158,10 @@ def open_drive(drive: Path) -> list[Recording]:
     """The cameras of a raw drive in parts without gaps; none where it has no images."""
     drive = drive.absolute()
     oxts = drive / "oxts" / "data"
-    folders = {
-        c: folder for c in RAW_CAMERAS if has_images(folder := drive / f"image_{c}" / "data")
-    }
+    folders: dict[str, Path] = {}
+    for camera in RAW_CAMERAS:
+        if has_images(folder := drive / f"image_{camera}" / "data"):
+            folders[camera] = folder
     recordings = []
     for camera, files, (height, width) in _cameras(folders):
         calibration = CalibrationFile(drive.parent / CAM_TO_CAM)
@@ -165,14 +205,10 @@ def _own(root: Path) -> list[Recording]:
     images: list[Path] = []
     if not is_video:  # those of a folder, or those of its one sub-folder of a usual name, or of the first that has any
         usual = image_folder(home)
-        folders = (
-            [usual]
-            if usual is not None
-            else sorted(path for path in home.iterdir() if path.is_dir())
-        )
+        folders = [usual] if usual is not None else sorted(filter(Path.is_dir, home.iterdir()))
         images = next((found for folder in folders if (found := list_images(folder))), [])
     if not images:
-        videos = [Video(file) for file in ([root] if is_video else list_videos(home))]
+        videos = map(Video, [root] if is_video else list_videos(home))
         return [
             Recording(f"folder/{video_name(v.path)}", (v.path,) * len(v), camera, v) for v in videos
         ]

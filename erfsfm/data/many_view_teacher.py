@@ -1,8 +1,9 @@
-"""The many-view teacher of whole drives: poses by the SLAM system once a drive, then a label for every few frames.
+"""The many-view teacher of whole drives: poses once a drive, then a label for every few frames.
 
-All of it is kept in a folder under a digest of the drive's images and camera, so that it is computed once. In a
-prepared folder a label is a small picture: bounds are rounded by a third of a sigma on average. The networks' package
-does not import the SLAM system: what goes between them are a folder of images and a trajectory.
+The SLAM system gives the poses. All of it is kept in a folder under a digest of the drive's images and
+camera, so that it is computed once. In a prepared folder a label is a small picture
+(`erfsfm.data.label_file`). The networks' package does not import the SLAM system: what goes between
+them are a folder of images and a trajectory.
 """
 
 from __future__ import annotations
@@ -27,10 +28,12 @@ from erfsfm.common.files import FolderLock, write_atomically
 from erfsfm.common.processes import limit_library_threads, processes, slam_process
 from erfsfm.common.progress import Progress
 from erfsfm.common.readers.video import VideoFrames
+from erfsfm.data.label_file import decode
 from erfsfm.data.recordings import Recording
 from erfsfm.data.window import ArrayCache, TeacherStructure, snippet_motion
 from erfsfm.geometry import Camera
-from erfsfm.labels import NEIGHBOURS, in_camera_heights, label, measure, refined_label, shrunk
+from erfsfm.labels.flow_labels import NEIGHBOURS, label, measure
+from erfsfm.labels.refined_labels import in_camera_heights, refined_label, shrunk
 from erfsfm.mvs.views import Grey, neighbours_around
 
 VERSION = 4
@@ -137,9 +140,9 @@ class DriveLabels:
                 "--device",
                 "cpu",
             ]
-            reason = slam_process(
-                [*words, *(word for setting in _SETTINGS for word in ("--set", setting))]
-            )
+            for setting in _SETTINGS:
+                words += ["--set", setting]
+            reason = slam_process(words)
             if reason or not (output / _TRAJECTORY).is_file():
                 raise TrainingError(
                     f"the teacher's poses of {name} could not be found: {reason or 'it wrote none'}"
@@ -181,13 +184,10 @@ class DriveLabels:
             bounds = self._bounds(target, learned)
             if bounds is None:
                 bounds = np.zeros(self.size, np.float32), np.full(self.size, np.inf, np.float32)
-            least, most = (
-                cv2.resize(values, self.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(
-                    np.float16
-                )
-                for values in bounds
-            )
-            arrays = {"least": least, "most": most}
+            arrays = {}
+            for name, values in zip(("least", "most"), bounds):
+                resized = cv2.resize(values, self.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+                arrays[name] = resized.astype(np.float16)
             write_atomically(
                 self.label_file(target), partial(np.savez_compressed, **arrays), sync=False
             )
@@ -231,7 +231,12 @@ class DriveLabels:
 
     def _greys(self, frames: Iterable[int], camera: Camera) -> dict[int, Grey]:
         """Those frames that can be read."""
-        return {n: _grey(image) for n in frames if (image := self._image(n, camera)) is not None}
+        greys = {}
+        for n in frames:
+            image = self._image(n, camera)
+            if image is not None:
+                greys[n] = _grey(image)
+        return greys
 
     def _motion(self, target: int, others: Iterable[int]) -> NDArray[np.float64]:
         """``T_other_target`` ``(N, 4, 4)``."""
@@ -285,9 +290,10 @@ class ManyViewTeacher:
                 )
             else:
                 # of the camera, the names, sizes and times of the images, and the version of this file
-                stats = [(path.name, path.stat()) for path in sorted(set(recording.images))]
                 seen = [f"{VERSION} {recording.camera} {recording.start} {len(recording)}"]
-                seen += [f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in stats]
+                for path in sorted(set(recording.images)):
+                    stat = path.stat()
+                    seen.append(f"{path.name} {stat.st_size} {stat.st_mtime_ns}")
                 digest = hashlib.sha256("\n".join(seen).encode()).hexdigest()[:_DIGITS]
                 drive = DriveLabels(recording, self._folder / digest, self._size, self._stride)
             self._drives[recording.key] = drive
@@ -317,7 +323,7 @@ class ManyViewTeacher:
         """
         with FolderLock() as lock:
             lock.take(self._folder, waits=True)
-            drives = [self.drive(recording) for recording in recordings]
+            drives = list(map(self.drive, recordings))
             for drive in drives:
                 drive.require_weights(weights)
             without = [drive for drive in drives if not drive.poses_file.is_file()]
@@ -328,10 +334,8 @@ class ManyViewTeacher:
                     for target in drive.targets(sources)
                     if not drive.label_file(target).is_file()
                 ]
-                tasks += [
-                    (drive, missing[first : first + _CHUNK])
-                    for first in range(0, len(missing), _CHUNK)
-                ]
+                for first in range(0, len(missing), _CHUNK):
+                    tasks.append((drive, missing[first : first + _CHUNK]))
             for drive in (*without, *(drive for drive, _ in tasks)):
                 if drive.compact:
                     raise TrainingError(
@@ -347,10 +351,9 @@ class ManyViewTeacher:
                     progress("teacher: depth", drive.measure_labels(chunk), total)
             elif tasks:
                 with processes("measures labels") as pool:
-                    running = [
-                        pool.submit(drive.measure_labels, chunk, self._learned)
-                        for drive, chunk in tasks
-                    ]
+                    running = []
+                    for drive, chunk in tasks:
+                        running.append(pool.submit(drive.measure_labels, chunk, self._learned))
                     for future in as_completed(running):
                         done += future.result()
                         progress("teacher: depth", done, total)
@@ -358,57 +361,3 @@ class ManyViewTeacher:
 
 def _grey(image: NDArray[np.uint8]) -> Grey:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
-
-
-SMALLEST = 0.002  # inverse depth of code 0, one over camera heights: 800 m; code 255 is 0.7 m
-STEP = 0.0275  # of the logarithm of the inverse depth between codes
-LEAST_SIGMA = 0.01  # of the logarithm, of the first kind of measured pixel
-_UNKNOWN, _AT_LEAST, _AT_MOST, _MEASURED = range(
-    4
-)  # kinds of pixels; each further kind has twice the sigma
-_WIDEST = 8
-_LOSSLESS = [cv2.IMWRITE_WEBP_QUALITY, 101]
-
-Bound = NDArray[np.float16]
-
-
-def encode(least: NDArray[np.floating], most: NDArray[np.floating]) -> bytes:
-    """The file of a label with these bounds, ``(H, W)`` each: 0 and infinite where unknown."""
-    has_least, has_most = least > 0, np.isfinite(most)
-    measured = has_least & has_most
-    known = has_least | has_most
-    low = np.log(np.where(has_least, least, np.where(known, most, 1)).astype(np.float32))
-    high = np.log(np.where(has_most, most, np.where(known, least, 1)).astype(np.float32))
-    sigma = np.maximum((high - low) / 2, LEAST_SIGMA)
-    doublings = np.clip(np.rint(np.log2(sigma / LEAST_SIGMA)), 0, _WIDEST)
-    one_sided = np.where(has_least, _AT_LEAST, np.where(has_most, _AT_MOST, _UNKNOWN))
-    kind = np.where(measured, _MEASURED + doublings, one_sided)
-    steps = np.where(measured, np.maximum(np.floor(LEAST_SIGMA * 2**doublings / STEP), 1), 1)
-    code = (low + high - 2 * np.log(SMALLEST)) / (2 * STEP)
-    code = np.clip(np.rint(code / steps) * steps, 0, 255)
-    # an unknown pixel has the code of the known one left of it: small when compressed
-    known_before = np.maximum.accumulate(np.where(known, np.arange(least.shape[1]), 0), axis=1)
-    picture = np.zeros((*least.shape, 3), np.uint8)
-    picture[..., 0], picture[..., 1] = (
-        kind,
-        np.take_along_axis(code.astype(np.uint8), known_before, axis=1),
-    )
-    return bytes(cv2.imencode(".webp", picture, _LOSSLESS)[1])
-
-
-def decode(data: bytes) -> tuple[Bound, Bound]:
-    """Least and most inverse depth ``(H, W)``; ``ValueError`` where these bytes are no label."""
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
-    if picture is None:
-        raise ValueError("it is no picture")
-    kinds = np.arange(256)
-    measured, codes = kinds >= _MEASURED, np.arange(256)
-    sigma = np.where(measured, LEAST_SIGMA * 2.0 ** np.clip(kinds - _MEASURED, 0, _WIDEST), 0)
-    value = SMALLEST * np.exp(STEP * codes)
-    bounded_below, bounded_above = measured | (kinds == _AT_LEAST), measured | (kinds == _AT_MOST)
-    ratio_least = np.where(bounded_below, np.exp(-sigma), 0).astype(np.float32)
-    ratio_most = np.where(bounded_above, np.exp(sigma), np.inf).astype(np.float32)
-    kind, middle = picture[..., 0], value.astype(np.float32)[picture[..., 1]]
-    return (middle * ratio_least[kind]).astype(np.float16), (middle * ratio_most[kind]).astype(
-        np.float16
-    )

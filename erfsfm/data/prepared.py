@@ -25,7 +25,8 @@ from erfsfm.common.files import write_atomically
 from erfsfm.common.progress import Progress
 from erfsfm.common.readers.images import report_unreadable
 from erfsfm.config import NetworkConfig
-from erfsfm.data.many_view_teacher import DriveLabels, ManyViewTeacher, encode
+from erfsfm.data.label_file import encode
+from erfsfm.data.many_view_teacher import DriveLabels, ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.window import Snippet
 from erfsfm.geometry import Camera

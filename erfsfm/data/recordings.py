@@ -199,5 +199,8 @@ def split_at_gaps(whole: Recording, files: NumberedFiles) -> list[Recording]:
             files.describe_gaps(),
             len(files.parts()),
         )
-    parts = [replace(whole.part(a, b), start=files.first + files.rows[a]) for a, b in files.parts()]
-    return [replace(part, stored=len(files.paths)) for part in parts]
+    parts = []
+    for begin, end in files.parts():
+        start = files.first + files.rows[begin]
+        parts.append(replace(whole.part(begin, end), start=start, stored=len(files.paths)))
+    return parts

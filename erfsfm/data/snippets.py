@@ -35,6 +35,8 @@ from erfsfm.data.window import (
 from erfsfm.geometry import Camera
 
 _VALIDATED = 40  # snippets: as many as the shipped weights were chosen by
+# what the simulator leaves unknown is sky; of a depth camera it may be anywhere
+FARTHEST_M = 200.0
 
 
 class SnippetDraws(IterableDataset[dict[str, Tensor]]):
@@ -98,7 +100,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
             range(self._first_draw + self._rank * batch, self._draws, batch * processes)
         ):
             if number % count == index:
-                yield from (self.draw(i) for i in range(first, min(first + batch, self._draws)))
+                yield from map(self.draw, range(first, min(first + batch, self._draws)))
 
     def draw(self, number: int) -> dict[str, Tensor]:
         """Sample ``number``, a `training_sample` of the first snippet drawn that can be read.
@@ -194,14 +196,15 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
             config.data.cache_mb, (self._network.height, self._network.width, 3), np.uint8
         )
         length = config.network.sources + 1
-        windows = [
-            Snippet(r, first)
-            for r in usable(recordings, length)
-            for first in range(len(r) - length + 1)
-        ]
+        windows = []
+        for recording in usable(recordings, length):
+            for first in range(len(recording) - length + 1):
+                windows.append(Snippet(recording, first))
         chosen = np.linspace(0, len(windows) - 1, min(_VALIDATED, len(windows)))
-        self.snippets, reasons = [], []
-        for snippet in (windows[int(i)] for i in chosen.round()):
+        self.snippets: list[Snippet] = []
+        reasons: list[str] = []
+        for i in chosen.round():
+            snippet = windows[int(i)]
             try:
                 self._read(snippet)
                 self.snippets.append(snippet)
@@ -254,9 +257,6 @@ def chances(
     return np.asarray(total / total.sum()) if len(recordings) else total
 
 
-FARTHEST_M = 200.0  # what the simulator leaves unknown is sky; of a depth camera it may be anywhere
-
-
 class ExactLabels:
     """Labels of recordings with exact depth, in camera heights, of the size that the cache has them in."""
 
@@ -294,8 +294,11 @@ def by_label(
     recordings: Sequence[Recording], config: ExperimentConfig
 ) -> tuple[list[Recording], list[Recording]]:
     """The recordings of which single images with exact depth are drawn, and those of which snippets are."""
-    exact = [recording for recording in recordings if recording.exact]
-    measured = [recording for recording in recordings if not recording.exact]
+    exact: list[Recording] = []
+    measured: list[Recording] = []
+    for recording in recordings:
+        kind = exact if recording.exact else measured
+        kind.append(recording)
     if config.teacher.exact and measured:
         raise DataError(
             f"teacher.views=exact needs the true depth of every recording; {measured[0].name} has none: simulate with "
@@ -313,5 +316,8 @@ def by_label(
 
 def stacked(samples: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     """A batch: of every tensor those of the samples that have it, in order."""
-    keys = dict.fromkeys(key for sample in samples for key in sample)
-    return {key: torch.stack([sample[key] for sample in samples if key in sample]) for key in keys}
+    tensors: dict[str, list[Tensor]] = {}
+    for sample in samples:
+        for key, tensor in sample.items():
+            tensors.setdefault(key, []).append(tensor)
+    return {key: torch.stack(each) for key, each in tensors.items()}

@@ -5,31 +5,25 @@ Names are those of `erfsfm.common.readers.frame_range`.
 The shipped ones lie in ``configs/splits``. Single frames are written as runs: ``[0:64:3, 69, 72]`` are the frames
 0, 3, ..., 63, 69 and 72.
 
-Frames in which the car stands still are left out: there only traffic moves, which gives a wrong depth. They are told by
-the speed of the GPS/IMU, or by image differences where there is none. A packet or an image that cannot be read is taken
-for one of a moving car.
+Frames in which the camera stands still are left out (`erfsfm.data.standstill`).
 """
 
 from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Sequence
-from functools import lru_cache
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from erfsfm.common.config_tree import Section, read_model
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.frame_range import EVERYTHING, KINDS, FrameRange
-from erfsfm.common.readers.kitti import velocity
 from erfsfm.config import EIGEN, DataConfig, config_folders
 from erfsfm.data.discovery import discover
 from erfsfm.data.recordings import Recording
+from erfsfm.data.standstill import moving_parts
 
 logger = logging.getLogger(__name__)
 
@@ -56,8 +50,11 @@ class Split(Section):
     @property
     def test_recordings(self) -> list[str]:
         """Recordings with a frame to test on, without their frames."""
-        matches = [(name.strip(), _FRAMES.fullmatch(name.strip())) for name in self.test]
-        return [name if match is None else match["recording"] for name, match in matches]
+        recordings = []
+        for name in self.test:
+            match = _FRAMES.fullmatch(name.strip())
+            recordings.append(name.strip() if match is None else match["recording"])
+        return recordings
 
     def test_frames(self) -> list[tuple[str, int]]:
         """Every single frame to test on: its recording and number."""
@@ -74,7 +71,8 @@ class Split(Section):
             for run in filter(None, runs):
                 first = int(run["first"])
                 numbers = range(first, int(run["stop"] or first + 1), int(run["step"] or 1))
-                frames += [(match["recording"], number) for number in numbers]
+                for number in numbers:
+                    frames.append((match["recording"], number))
         return frames
 
 
@@ -84,7 +82,10 @@ def read_split_file(name_or_path: str) -> Split:
     if not path.is_file():
         wheel, source = config_folders()  # beside the named configurations
         folders = wheel / "splits", source.parent / "splits"
-        shipped = {file.stem: file for folder in folders for file in sorted(folder.glob("*.yaml"))}
+        shipped: dict[str, Path] = {}
+        for folder in folders:
+            for file in sorted(folder.glob("*.yaml")):
+                shipped[file.stem] = file
         if name_or_path not in shipped:
             raise DataError(
                 f"no split '{name_or_path}': neither a file nor one of {', '.join(shipped)}"
@@ -104,70 +105,119 @@ def usable(recordings: Sequence[Recording], length: int) -> list[Recording]:
 
 
 def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recording]]:
-    """Training and validation recordings of all roots, by the configuration's split, ranges and exclusions."""
+    """Training and validation recordings of all roots.
+
+    They are chosen by the configuration's split, ranges and exclusions; stops are left out.
+
+    Raises:
+        DataError: no roots, a name that fits no recording or kind of recordings, a range that begins
+            after the end of its recording, or nothing left to train or to validate on.
+    """
     if not config.roots:
         raise DataError("no data to train on: name data sets with --dataset ROOT or data.roots")
     split = read_split_file(config.split) if config.split else Split()
-    left_out = read_split_file(EIGEN).test_recordings if EIGEN in config.exclude else []
-    scenes = [FrameRange.parse(name) for name in left_out]
-    ranges = [FrameRange.parse(f"{key}[{span}]") for key, span in config.ranges.items()]
-    listed = [FrameRange.parse(name) for name in split.train]
-    held_out = [FrameRange.parse(name) for name in (*config.validation, *split.validation)]
-    excluded = [name for name in config.exclude if name != EIGEN]
-    never = [FrameRange.parse(name) for name in (*excluded, *split.test_recordings)]
-    unknown = [str(each) for each in never if each.recording.partition("/")[0] not in KINDS]
-    if unknown:
-        raise DataError(
-            f"data.exclude names '{unknown[0]}', but names of recordings begin with {_some(KINDS)}"
-        )
-    found = [recording for root in config.roots for recording in discover(root)]
-    names = _some([recording.name for recording in found])
-    for key, span in zip(config.ranges, ranges):
-        if not any(_spans(recording, [span]) for recording in found):
-            raise DataError(
-                f"data.ranges names '{key}', but no recording has that name; found {names}"
-            )
-    _require_begun(found, [*ranges, *listed, *held_out])
+    division = _Division(config, split)
+    found: list[Recording] = []
+    for root in config.roots:
+        found += discover(root)
+    division.require_found(found)
     training: list[Recording] = []
     validation: list[Recording] = []
     for recording in found:
-        validation += _parts(recording, held_out)
-        forbidden = [
-            *held_out,
-            *never,
-            *(scenes if recording.name.startswith("kitti_raw/") else []),
-        ]
-        chosen = next(
-            (each for each in (ranges, listed) if _spans(recording, each)), None
-        )  # ranges before a list
-        whole = [] if listed else [recording]
-        for part in whole if chosen is None else _parts(recording, chosen):
-            training += _rest(part, forbidden)
+        validation += _parts(recording, division.held_out)
+        for part in division.chosen(recording):
+            training += _rest(part, division.forbidden(recording))
     if not training:
         raise DataError(
-            f"nothing left to train on: every recording found ({names}) is excluded or used to validate or "
-            "test; see data.exclude, data.validation and data.split"
+            f"nothing left to train on: every recording found ({_names(found)}) is excluded or used "
+            "to validate or test; see data.exclude, data.validation and data.split"
         )
     if config.validation_share > 0:
         training, ends = _ends_split_off(training, config.validation_share)
         validation += ends
-    if (
-        not validation
-        and (split.validation or config.validation != _DEFAULT_VALIDATION)
-        and config.validation
-    ):
+    if not validation:
+        _require_none_wanted(config, split, found)
+    if config.validation != _DEFAULT_VALIDATION:
+        _warn_of_absent(config.validation, found)
+    return _without_stops(training), _without_stops(validation)
+
+
+class _Division:
+    """The frame ranges that a configuration and its split name.
+
+    Attributes:
+        ranges: parts that train, of the recordings they name; they come before those of the list.
+        listed: recordings or parts that train; without any, all that are found do.
+        held_out: what validates, and hence does not train.
+        never: what does not train, being excluded or used to test.
+        scenes: the same of KITTI raw drives: Eigen's test scenes, where they are excluded.
+    """
+
+    def __init__(self, config: DataConfig, split: Split) -> None:
+        left_out = read_split_file(EIGEN).test_recordings if EIGEN in config.exclude else []
+        self.scenes = _parsed(left_out)
+        self.keys = list(config.ranges)
+        self.ranges = _parsed(f"{key}[{span}]" for key, span in config.ranges.items())
+        self.listed = _parsed(split.train)
+        self.held_out = _parsed((*config.validation, *split.validation))
+        excluded = [name for name in config.exclude if name != EIGEN]
+        self.never = _parsed((*excluded, *split.test_recordings))
+        for each in self.never:
+            if each.recording.partition("/")[0] not in KINDS:
+                raise DataError(
+                    f"data.exclude names '{each}', but names of recordings begin with {_some(KINDS)}"
+                )
+
+    def require_found(self, found: Sequence[Recording]) -> None:
+        """Refuse ranges of recordings that are not there, or that are shorter."""
+        for key, each in zip(self.keys, self.ranges):
+            if not _is_found(each, found):
+                raise DataError(
+                    f"data.ranges names '{key}', but no recording has that name; "
+                    f"found {_names(found)}"
+                )
+        _require_begun(found, [*self.ranges, *self.listed, *self.held_out])
+
+    def chosen(self, recording: Recording) -> list[Recording]:
+        """The parts of a recording that train, if nothing forbids it."""
+        for named in (self.ranges, self.listed):
+            if _spans(recording, named):
+                return _parts(recording, named)
+        return [] if self.listed else [recording]
+
+    def forbidden(self, recording: Recording) -> list[FrameRange]:
+        """What of a recording does not train."""
+        scenes = self.scenes if recording.name.startswith("kitti_raw/") else []
+        return [*self.held_out, *self.never, *scenes]
+
+
+def _parsed(names: Iterable[str]) -> list[FrameRange]:
+    return list(map(FrameRange.parse, names))
+
+
+def _is_found(frames: FrameRange, found: Sequence[Recording]) -> bool:
+    return any(frames.counted_in(recording.name) is not None for recording in found)
+
+
+def _names(recordings: Sequence[Recording]) -> str:
+    return _some([recording.name for recording in recordings])
+
+
+def _require_none_wanted(config: DataConfig, split: Split, found: Sequence[Recording]) -> None:
+    """Refuse an empty validation where the configuration or its split name one."""
+    is_named = split.validation or config.validation != _DEFAULT_VALIDATION
+    if is_named and config.validation:
         wanted = _some([*config.validation, *split.validation])
         raise DataError(
-            f"nothing to validate on: data.validation and data.split name {wanted}; found {names}; name one of "
-            "these, or train without validation by data.validation=[]"
+            f"nothing to validate on: data.validation and data.split name {wanted}; found "
+            f"{_names(found)}; name one of these, or train without validation by data.validation=[]"
         )
-    named = config.validation if config.validation != _DEFAULT_VALIDATION else []
-    absent = [
-        name for name in named if not any(FrameRange.parse(name).counted_in(r.name) for r in found)
-    ]
+
+
+def _warn_of_absent(names: Sequence[str], found: Sequence[Recording]) -> None:
+    absent = [name for name in names if not _is_found(FrameRange.parse(name), found)]
     if absent:
         logger.warning("data.validation names %s, which is not among the data", _some(absent))
-    return _without_stops(training), _without_stops(validation)
 
 
 def _ends_split_off(
@@ -205,20 +255,21 @@ def _spans(recording: Recording, ranges: Sequence[FrameRange]) -> list[FrameRang
 
 def _parts(recording: Recording, ranges: Sequence[FrameRange]) -> list[Recording]:
     """The parts of a recording that frame ranges name."""
-    parts = (recording.within(span.start, span.stop) for span in _spans(recording, ranges))
-    return [part for part in parts if part is not None]
+    parts: list[Recording] = []
+    for span in _spans(recording, ranges):
+        part = recording.within(span.start, span.stop)
+        parts += [] if part is None else [part]
+    return parts
 
 
 def _rest(recording: Recording, ranges: Sequence[FrameRange]) -> list[Recording]:
     """The parts of a recording before, between and after frame ranges."""
     rest = [recording]
     for span in _spans(recording, ranges):
-        sides = (
-            side
-            for part in rest
-            for side in (part.within(0, span.start), part.within(span.stop, EVERYTHING))
-        )
-        rest = [part for part in sides if part is not None]
+        sides: list[Recording | None] = []
+        for part in rest:
+            sides += [part.within(0, span.start), part.within(span.stop, EVERYTHING)]
+        rest = [side for side in sides if side is not None]
     return rest
 
 
@@ -253,68 +304,3 @@ def _without_stops(recordings: list[Recording]) -> list[Recording]:
             "the camera stands still in every frame found: nothing can be learned from them"
         )
     return kept
-
-
-STILL_M_S = 0.5  # 5 cm a frame
-STILL_LEVELS = 1.5  # of 255; five real drives at 2.4 m/s and more never changed by less than 2
-_SMALL = (104, 32)  # columns, rows: coarse enough to average noise away
-
-
-def moving_parts(recording: Recording, shortest_stop: int = 1) -> list[Recording]:
-    """The stretches of a recording between stops of that many frames, in order; all of it where it never stops."""
-    if recording.oxts is None:
-        still = _unchanged(recording)
-    else:
-        still = _speeds(recording.oxts, recording.start, len(recording)) < STILL_M_S
-    moving = np.ones(len(recording), np.bool_)
-    for start, stop in _runs(still):
-        moving[start:stop] = stop - start < shortest_stop
-    return [recording.part(int(start), int(stop)) for start, stop in _runs(moving)]
-
-
-def _runs(chosen: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Starts and ends ``(K, 2)`` of the runs of chosen frames."""
-    return np.flatnonzero(np.diff(chosen.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
-
-
-@lru_cache(maxsize=1)
-def _speeds(oxts: Path, start: int, frames: int) -> NDArray[np.float64]:
-    """``(N,)`` in m/s, NaN where unknown; the cameras of a drive share them."""
-    speeds = np.full(frames, np.nan)
-    reasons = []
-    for index in range(frames):
-        try:
-            speeds[index] = np.linalg.norm(velocity(oxts, start + index))
-        except DataError as error:
-            reasons.append(str(error))
-    if len(reasons) == frames:
-        raise DataError(reasons[0])
-    if reasons:
-        logger.warning(
-            "%d of %d frames have no speed and are kept: %s", len(reasons), frames, reasons[0]
-        )
-    return speeds
-
-
-def _unchanged(recording: Recording) -> NDArray[np.bool_]:
-    """Whether an image hardly differs from the last before it, by its median absolute change of grey level, ``(N,)``.
-
-    The median is robust to traffic. The median change itself is subtracted first, as a change of exposure. The first
-    frame has the result of the second.
-    """
-    columns, rows = _SMALL
-    changes = np.full(len(recording), np.nan)
-    previous: NDArray[np.float32] | None = None
-    for index in range(len(recording)):
-        try:
-            image = cv2.cvtColor(recording.image(index, rows, columns), cv2.COLOR_RGB2GRAY).astype(
-                np.float32
-            )
-        except DataError:
-            continue  # whoever reads the snippets names it
-        if previous is not None:
-            change = image - previous
-            changes[index] = np.median(np.abs(change - np.median(change)))
-        previous = image
-    changes[0] = changes[min(1, len(changes) - 1)]
-    return changes < STILL_LEVELS

@@ -27,6 +27,7 @@ _MOST_IN_A_ROW = 20
 _MOST_NAMED = 10
 
 T = TypeVar("T")
+_BLOCK = 128  # arrays of the cache that are stored together
 
 
 @dataclass(frozen=True)
@@ -87,9 +88,6 @@ def first_readable(
                 more = "; more files are not named" if len(named) == _MOST_NAMED else ""
                 logger.warning("%s: snippets with it are passed over%s", reason, more)
     raise DataError(f"{_MOST_IN_A_ROW} snippets in a row cannot be read, the last: {reason}")
-
-
-_BLOCK = 128  # arrays
 
 
 class ArrayCache:

@@ -37,6 +37,10 @@ from erfsfm.inference import DepthPosePredictor, refuse_leak
 
 _STILL_M = 0.1
 _FLAT_ROAD_M = 20.0
+_FRAME = re.compile(
+    r"(?:(?P<date>\d{4}_\d\d_\d\d)/)?(?P<drive>(?P<day>\d{4}_\d\d_\d\d)_drive_\d{4})(?:_sync)?"
+    r"(?:/image_0(?P<camera>[23])/data/(?P<file>\d+)(?:\.\w+)?|\s+(?P<frame>\d+)(?:\s+(?P<side>[lr]))?)"
+)
 
 
 def read_split(split: str, root: Path) -> list[RawFrame]:
@@ -127,9 +131,9 @@ def eigen_protocol(
         by_motion = compare(guess, truth, scaling=scale) if scale is not None else None
         if by_motion is not None:
             errors["pose"].append(by_motion)
-    rows = [
-        _row("networks", scaling, found, len(frames), leak) for scaling, found in errors.items()
-    ]
+    rows = []
+    for scaling, compared in errors.items():
+        rows.append(_row("networks", scaling, compared, len(frames), leak))
     return [*rows, _row("flat road", "gt-median", flat, len(frames), leak=False)]
 
 
@@ -154,21 +158,12 @@ def _row(
         row |= {"abs_rel": None, "abs_rel_reason": "the car stands still in every frame"}
         return row | {"images": 0, "leak": leak}
     mean = asdict(mean_errors(list(errors)))
-    row |= {key: value if np.isfinite(value) else None for key, value in mean.items()}
-    row |= {
-        f"{key}_reason": "an image has no scale"
-        for key, value in mean.items()
-        if not np.isfinite(value)
-    }
+    without = [key for key, value in mean.items() if not np.isfinite(value)]
+    row |= mean | dict.fromkeys(without)
+    row |= {f"{key}_reason": "an image has no scale" for key in without}
     scales = np.array([error.scale for error in errors])
     row["scale_spread"] = float(scales.std() / scales.mean()) if scales.any() else None
     return row | {"images": len(errors), "left_out": wanted - len(errors), "leak": leak}
-
-
-_FRAME = re.compile(
-    r"(?:(?P<date>\d{4}_\d\d_\d\d)/)?(?P<drive>(?P<day>\d{4}_\d\d_\d\d)_drive_\d{4})(?:_sync)?"
-    r"(?:/image_0(?P<camera>[23])/data/(?P<file>\d+)(?:\.\w+)?|\s+(?P<frame>\d+)(?:\s+(?P<side>[lr]))?)"
-)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from onnxruntime import InferenceSession
 from erfsfm.common.errors import CheckpointError
 from erfsfm.common.files import read_bytes
 from erfsfm.common.processes import open_session
-from erfsfm.mvs.refine import CHANGES, SIGMA_FLOOR, UNIT, Costs, Measurement, RefinedDepth, lowest
+from erfsfm.mvs.plane_sweep import CHANGES, UNIT, Costs, lowest
+from erfsfm.mvs.refine import SIGMA_FLOOR, Measurement, RefinedDepth
 from erfsfm.mvs.views import Array
 
 FILE = "fusion.onnx"

@@ -1,8 +1,7 @@
 """Learned depth as a prior, neighbouring images at known poses as the measurement.
 
-A plane sweep (Collins 1996, Gallup et al. 2007) around the prior at half size finds each pixel's change of depth. Its
-costs are smoothed by semi-global matching (Hirschmüller 2008) along four directions, in integers. The change is brought
-to full size along the edges of the image and sharpened by Gauss-Newton steps on all neighbours at once.
+A plane sweep around the prior at half size finds each pixel's change of depth. The change is brought to
+full size along the edges of the image and sharpened by Gauss-Newton steps on all neighbours at once.
 """
 
 from __future__ import annotations
@@ -14,10 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.mvs.plane_sweep import WINDOW_PX, Costs, is_inside, lowest, smoothed, sweep, warped
 from erfsfm.mvs.views import Appearance, Array, Projection, halved
 
 STEPS = 2
-WINDOW_PX = 5
 RESIDUAL = 0.5  # of normalised grey levels, beyond which a pixel loses weight
 RESIDUAL_FLOOR = 0.02  # least variance of the residuals
 SWEEP_SIGMA = 0.06  # of log inverse depth, before the Gauss-Newton steps
@@ -83,13 +82,15 @@ def measure(
     (height, width), (h, w) = depth.shape, target.coarse.shape
     inverse = (1 / depth).astype(np.float32)
     small = np.asarray(cv2.resize(inverse, (w, h), interpolation=cv2.INTER_AREA), np.float32)
-    pairs = list(zip(neighbours, T_neighbour_target))
-    costs = sweep(
-        target.coarse, [(other.coarse, Projection(halved(K), T, h, w)) for other, T in pairs], small
-    )
+    views: list[tuple[Appearance, Projection]] = []
+    small_views: list[tuple[Array, Projection]] = []
+    for other, T in zip(neighbours, T_neighbour_target):
+        views.append((other, Projection(K, T, height, width)))
+        small_views.append((other.coarse, Projection(halved(K), T, h, w)))
+    costs = sweep(target.coarse, small_views, small)
     coarse = lowest(smoothed(costs, target.coarse_grey))
     change = _enlarged(np.asarray(cv2.medianBlur(coarse, 5), np.float32), target)
-    views = [(other, Projection(K, T, height, width)) for other, T in pairs]
+
     for _ in range(STEPS):
         step, information, fit = _gauss_newton(target.levels, views, inverse * np.exp(change))
         change += step
@@ -99,8 +100,10 @@ def measure(
 def _enlarged(change: Array, target: Appearance) -> Array:
     """To full size ``(H, W)``: a pixel takes the change of the one of four at half size with the nearest grey level."""
     height, width = target.grey.shape
-    changes, greys = (_doubled(part) for part in (change, target.coarse_grey))
-    best, nearest = np.empty_like(target.grey), np.full_like(target.grey, np.inf)
+    changes = _doubled(change)
+    greys = _doubled(target.coarse_grey)
+    best = np.empty_like(target.grey)
+    nearest = np.full_like(target.grey, np.inf)
     for top in (0, 2):
         for left in (0, 2):
             at = slice(top, top + height), slice(left, left + width)
@@ -128,9 +131,8 @@ def _gauss_newton(
         inside = is_inside(residual)
         residual *= inside
         weight = inside / np.square(1 + np.square(residual * np.float32(1 / RESIDUAL)))
-        along_x, along_y = (warped(slope, u, v) for slope in other.slopes)
         du, dv = projection.motion(u, v, z, inverse_depth)
-        slope = along_x * du + along_y * dv
+        slope = warped(other.slopes[0], u, v) * du + warped(other.slopes[1], u, v) * dv
         weighted = weight * slope
         squares += weighted * slope
         products += weighted * residual
@@ -146,122 +148,3 @@ def _gauss_newton(
     step = np.clip(-products / (squares + damping), -LARGEST_STEP, LARGEST_STEP)
     information = INDEPENDENT_PIXELS * squares / variance * np.square(weights / len(views))
     return step, information, weights / np.maximum(seen, 1e-3)
-
-
-# changes of the logarithm of inverse depth, denser near the guess; negative is farther
-CHANGES: Array = np.array(
-    [-2.4, -1.6, -1.0, -0.7, *(np.arange(-5, 7) / 10), 0.8, 1.0, 1.25], dtype=np.float32
-)
-LARGEST_DIFFERENCE = 0.8  # of normalised grey levels: more is an occlusion
-WEIGHT_UNSEEN = 0.5  # of the cost of the guess, in views
-COST_OF_CHANGE = 0.1  # a unit of log inverse depth
-_OUTSIDE = 1e3
-Costs = NDArray[np.int16]
-UNIT = 2048  # of costs: the sum over four paths stays below the largest integer
-LARGEST_COST = 2.9
-SMALL_STEP = 0.05  # penalty for a change of one sample between neighbouring pixels
-LARGE_STEP = 1.0  # for more, where the image is smooth
-EDGE_GREY_LEVELS = 8.0  # image step across which a large step costs 1/e of that
-
-
-def sweep(
-    levels: Array, neighbours: Sequence[tuple[Array, Projection]], inverse_depth: Array
-) -> Costs:
-    """Cost ``(C, h, w)`` of each change of the inverse depth.
-
-    Args:
-        levels: normalised target ``(h, w)``.
-        neighbours: normalised images ``(h, w)``, each with the projection into it.
-        inverse_depth: the guess ``(h, w)``.
-    """
-    costs = np.empty((len(CHANGES), *levels.shape), np.int16)
-    total, seen = _differences(levels, neighbours, inverse_depth)
-    # a change out of sight is neither better nor worse than the guess; the fewer see a pixel, the more that counts
-    unseen = total * np.float32(WEIGHT_UNSEEN) / np.maximum(seen, np.float32(1e-3))
-    for cost, change in zip(costs, CHANGES):
-        total, seen = _differences(levels, neighbours, inverse_depth * np.exp(change))
-        total += unseen
-        total += COST_OF_CHANGE * len(neighbours) * abs(change)
-        total /= seen + np.float32(WEIGHT_UNSEEN)
-        cost[:] = np.minimum(total, np.float32(LARGEST_COST)) * np.float32(UNIT)
-    return costs
-
-
-def _differences(
-    levels: Array, neighbours: Sequence[tuple[Array, Projection]], inverse_depth: Array
-) -> tuple[Array, Array]:
-    """Sums ``(h, w)`` over neighbours of truncated differences, and of how many see a pixel; means over the window."""
-    total, unseen = np.zeros_like(levels), np.zeros(levels.shape, np.uint8)
-    for other, projection in neighbours:
-        u, v, _ = projection.pixels(inverse_depth)
-        difference = cv2.absdiff(warped(other, u, v), levels)
-        unseen += ~is_inside(difference)
-        total += cv2.min(difference, LARGEST_DIFFERENCE)
-    window = (WINDOW_PX, WINDOW_PX)
-    missing = cv2.boxFilter(unseen, cv2.CV_32F, window)
-    return cv2.boxFilter(total, -1, window) - np.float32(LARGEST_DIFFERENCE) * missing, len(
-        neighbours
-    ) - missing
-
-
-def warped(image: Array, u: Array, v: Array) -> Array:
-    """An image at other pixels; very large outside of it."""
-    outside = (_OUTSIDE,) * 4
-    return np.asarray(
-        cv2.remap(
-            image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=outside
-        ),
-        np.float32,
-    )
-
-
-def is_inside(levels: Array) -> NDArray[np.bool_]:
-    """Which of the levels that ``warped`` gave lie inside of the image."""
-    return np.asarray(np.abs(levels) < _OUTSIDE / 100)
-
-
-def lowest(costs: Costs) -> Array:
-    """The change ``(h, w)`` of least cost, between samples by a parabola."""
-    best = costs.argmin(axis=0)
-    middle = np.clip(best, 1, len(costs) - 2)
-    around = (np.take_along_axis(costs, (middle + k)[None], axis=0)[0] for k in (-1, 0, 1))
-    before, at, after = (cost.astype(np.float32) for cost in around)
-    shift = np.clip((before - after) / (2 * np.maximum(before + after - 2 * at, 1)), -0.5, 0.5)
-    position = np.where(best == middle, middle + shift, best)
-    return np.asarray(np.interp(position, np.arange(len(costs)), CHANGES), np.float32)
-
-
-def smoothed(costs: Costs, grey: Array) -> Costs:
-    """Costs ``(C, h, w)`` that also count steps of the solution, which are cheap at edges of the image ``(h, w)``.
-
-    They are known up to a constant of each pixel.
-    """
-    by_row = _both_ways(costs.transpose(1, 0, 2), _penalties(grey))  # (h, C, w)
-    by_column = _both_ways(costs.transpose(2, 0, 1), _penalties(grey.T))  # (w, C, h)
-    return np.asarray(by_row.transpose(1, 0, 2) + by_column.transpose(1, 2, 0))
-
-
-def _penalties(grey: Array) -> Costs:
-    """Of a large step between each row and the one before, ``(h - 1, w)``."""
-    steps = np.abs(np.diff(grey, axis=0))
-    return np.asarray(
-        UNIT * (SMALL_STEP + LARGE_STEP * np.exp(-steps / EDGE_GREY_LEVELS)), np.int16
-    )
-
-
-def _both_ways(volume: Costs, penalties: Costs) -> Costs:
-    """Sum of path costs ``(h, C, w)`` downwards and upwards; both run in one loop."""
-    height, samples, width = volume.shape
-    padded = np.full((height, samples + 2, 2 * width), 4 * UNIT, np.int16)
-    down_up = padded[:, 1:-1]
-    down_up[..., :width], down_up[..., width:] = volume, volume[::-1]
-    down_up[0] -= down_up[0].min(axis=0)
-    path, small = np.empty_like(down_up[0]), np.int16(UNIT * SMALL_STEP)
-    for before, row, large in zip(padded, down_up[1:], np.hstack([penalties, penalties[::-1]])):
-        np.minimum(before[:-2], before[2:], out=path)
-        path += small
-        np.minimum(path, before[1:-1], out=path)
-        np.minimum(path, large, out=path)
-        row += path
-        row -= row.min(axis=0)
-    return np.asarray(down_up[..., :width] + down_up[::-1, :, width:])

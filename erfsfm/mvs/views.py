@@ -18,6 +18,13 @@ Array = NDArray[np.float32]
 NEIGHBOURHOOD_PX = 3.0  # standard deviation of the Gaussian window
 CONTRAST_FLOOR = 4.0  # grey levels: what is less is noise
 
+BASELINES = (0.07, 0.2)  # wanted distances over the median depth
+_RANGE = 2.5  # accepted factor on these
+_LARGEST_TURN_DEG = 20.0
+_MOST_NEIGHBOURS = 3
+_MAX_FRAMES_APART = 40
+LEAST_Z = 1e-3
+
 
 @dataclass(frozen=True)
 class Appearance:
@@ -55,14 +62,6 @@ def normalised(grey: Array) -> Array:
     return np.asarray(
         (grey - mean) / (np.sqrt(np.maximum(variance, 0)) + np.float32(CONTRAST_FLOOR)), np.float32
     )
-
-
-BASELINES = (0.07, 0.2)  # wanted distances over the median depth
-_RANGE = 2.5  # accepted factor on these
-_LARGEST_TURN_DEG = 20.0
-_MOST_NEIGHBOURS = 3
-_MAX_FRAMES_APART = 40
-LEAST_Z = 1e-3
 
 
 def neighbours(

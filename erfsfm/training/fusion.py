@@ -1,4 +1,4 @@
-"""The network that fuses learned depth with the measurements of neighbouring images, its samples and its training."""
+"""The training of the network that fuses learned depth with measurements of neighbouring images."""
 
 from __future__ import annotations
 
@@ -6,14 +6,10 @@ import json
 import math
 from collections.abc import Sequence
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
 
-import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -21,15 +17,13 @@ from erfsfm.common.errors import TrainingError
 from erfsfm.common.files import write_atomically
 from erfsfm.common.processes import processes
 from erfsfm.common.progress import Progress
-from erfsfm.data.augmentation import weathered
 from erfsfm.data.discovery import discover
 from erfsfm.data.recordings import Recording
-from erfsfm.data.snippets import FARTHEST_M
-from erfsfm.inference import DepthPosePredictor, depth_at, has_bfloat16
-from erfsfm.mvs.fusion import CHANGE, CHANNELS, FILE, FULL_SIZE, STEP, evidence
-from erfsfm.mvs.refine import measure
-from erfsfm.mvs.views import BASELINES, Appearance, Array, neighbours
+from erfsfm.inference import DepthPosePredictor, has_bfloat16
+from erfsfm.mvs.fusion import CHANGE, CHANNELS, FILE, FULL_SIZE, STEP
 from erfsfm.networks.torch_network import exported
+from erfsfm.training.fusion_net import LEVELS, FusionNet
+from erfsfm.training.fusion_samples import FusionSamples, Sample
 
 RECORD = "fusion.json"
 _BATCH = 8
@@ -37,20 +31,16 @@ _LEARNING_RATE, _LEAST_RATE = 2e-3, 0.01
 _WARM_UP = 100
 _WEIGHT_DECAY = 1e-3
 _HUBER = 0.02  # of log depth
-_RELATIVE, _LIKELIHOOD, _EDGES, _SKY = (
-    0.5,
-    0.1,
-    0.3,
-    0.2,
-)  # weights of losses beside the error of log depth
+_RELATIVE = 0.5  # weights of losses beside the error of log depth
+_LIKELIHOOD = 0.1
+_EDGES = 0.3
+_SKY = 0.2
 _EDGE_STEPS = (1, 2, 4)  # pixels
 _LARGEST_ERROR = 1.5  # of log depth, for the relative error
 _CHUNK = 100  # samples of one task and one seed
 _VALIDATION_SEED = 10**6
-_COVERAGE, _SIGMAS = (
-    0.9,
-    1.645,
-)  # the sigma is scaled so that this share of the errors is within as many of it
+_COVERAGE = 0.9  # the sigma is scaled so that this share of the errors is within as many of it
+_SIGMAS = 1.645
 
 
 def train_fusion(
@@ -123,7 +113,9 @@ def _drawn(
 
 
 def _chunk(roots: Sequence[Path], weights: str, seed: int) -> list[Sample]:
-    recordings = [recording for root in roots for recording in discover(root)]
+    recordings: list[Recording] = []
+    for root in roots:
+        recordings += discover(root)
     source = FusionSamples(
         recordings, DepthPosePredictor.from_weights(weights, runtime="onnx"), seed
     )
@@ -240,200 +232,7 @@ def _fit_sigma(net: FusionNet, data: Sequence[Sample]) -> dict[str, float]:
     assert net.head.bias is not None
     net.head.bias[8:] += torch.log(factor)
     all_errors = {name: torch.cat(parts) for name, parts in errors.items()}
-    return {f"{name}_mean": float(e.mean()) for name, e in all_errors.items()} | {
-        f"{name}_median": float(e.median()) for name, e in all_errors.items()
-    }
-
-
-WIDTHS = (16, 32, 64, 96)
-LEVELS = len(WIDTHS) - 1  # halvings inside the network
-_TRUST = 3.0  # of a fresh network in the measurement: its logit
-_UNSURE = -3.0  # logarithm of its sigma
-_LARGEST_CHANGE = 2.0
-
-
-class FusionNet(nn.Module):
-    """Evidence ``(B, channels, h, w)`` to the change of log inverse depth and the log of its sigma, ``(B, 2h, 2w)``.
-
-    The change is a mean of the measured one and one of its own, so a trusted measurement keeps its precision. Height
-    and width are multiples of ``2 ** LEVELS``.
-
-    Args:
-        channels: of the evidence.
-        measured: the first of the four channels with the measured change.
-    """
-
-    def __init__(self, channels: int, measured: int) -> None:
-        super().__init__()
-        self._measured = measured
-        self.down = nn.ModuleList(
-            nn.Sequential(*_layer(a, b), *_layer(b, b)) for a, b in pairwise((channels, *WIDTHS))
-        )
-        self.narrow = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in pairwise(WIDTHS[::-1]))
-        self.up = nn.ModuleList(nn.Sequential(*_layer(width, width)) for width in WIDTHS[-2::-1])
-        self.head = nn.Conv2d(WIDTHS[0], 12, 3, padding=1)
-        nn.init.zeros_(self.head.weight)
-        assert self.head.bias is not None
-        with torch.no_grad():
-            self.head.bias.copy_(torch.tensor([_TRUST, 0.0, _UNSURE]).repeat_interleave(4))
-
-    def forward(self, evidence: Tensor) -> tuple[Tensor, Tensor]:
-        """See the class."""
-        kept = [self.down[0](evidence)]
-        for block in list(self.down)[1:]:
-            kept.append(block(functional.max_pool2d(kept[-1], 2)))
-        decided = kept.pop()
-        for narrow, block in zip(self.narrow, self.up, strict=True):
-            larger = functional.interpolate(
-                narrow(decided), scale_factor=2, mode="bilinear", align_corners=False
-            )
-            decided = block(larger + kept.pop())
-        trust, own, log_sigma = self.head(decided).float().split(4, 1)
-        trust = torch.sigmoid(trust)
-        measured = evidence[:, self._measured : self._measured + 4]
-        change = trust * measured + (1 - trust) * _LARGEST_CHANGE * torch.tanh(own)
-        return functional.pixel_shuffle(change, 2)[:, 0], functional.pixel_shuffle(log_sigma, 2)[
-            :, 0
-        ]
-
-
-def _layer(inputs: int, outputs: int) -> list[nn.Module]:
-    return [
-        nn.Conv2d(inputs, outputs, 3, padding=1, bias=False),
-        nn.BatchNorm2d(outputs),
-        nn.ReLU(),
-    ]
-
-
-WIDTH = 416
-CROP = (64, 144)  # of the evidence
-_BASELINES = (*BASELINES, -BASELINES[0])  # as a run has them mostly
-_BASELINE_SPREAD = 0.4
-_LEFT_OUT = 0.1  # chance of each neighbour
-_WEATHER = 0.4
-_SCALE_SPREAD = 0.04
-_TURN_ERROR_DEG = 0.02
-_LENGTH_ERROR = 0.01
-_LEAST_KNOWN = 0.3  # of the pixels of a frame
-_MOST_TRIES = 200  # frames until one has depth and neighbours
-
-_WANTED = (
-    f"the fusion network is trained on simulated drives of at least {WIDTH}x{2 * CROP[0]} in shape; make some by "
-    "erfsfm-slam simulate W --depth"
-)
-
-
-class Sample(NamedTuple):
-    """``evidence`` ``(CHANNELS, h, w)``, and the wanted change of log inverse depth ``(2h, 2w)``.
-
-    Where the depth is not ``is_known`` ``(2h, 2w)`` there is sky, and the change to the least depth of it is wanted.
-    """
-
-    evidence: NDArray[np.float16]
-    wanted: NDArray[np.float16]
-    is_known: NDArray[np.bool_]
-
-
-class FusionSamples:
-    """Random frames of simulated drives, seen as a run sees its keyframes: poses, images and unit have errors."""
-
-    def __init__(
-        self, recordings: Sequence[Recording], networks: DepthPosePredictor, seed: int
-    ) -> None:
-        posed = [
-            (r, poses)
-            for r in recordings
-            if r.depth is not None and (poses := r.true_poses()) is not None
-        ]
-        if not posed:
-            raise TrainingError(f"no drive has depth maps and poses: {_WANTED}")
-        flat = [r for r, _ in posed if _height(r) < 2 * CROP[0]]
-        if flat:
-            raise TrainingError(f"{flat[0].name} has flatter images: {_WANTED}")
-        self._recordings, self._poses = zip(*posed, strict=True)
-        self._networks, self._rng = networks, np.random.default_rng(seed)
-
-    def draw(self) -> Sample:
-        """Of a random crop of a random frame.
-
-        Raises:
-            TrainingError: no frame has depth and neighbours.
-        """
-        for _ in range(_MOST_TRIES):
-            which = int(self._rng.integers(len(self._recordings)))
-            index = int(self._rng.integers(len(self._recordings[which])))
-            truth = self._recordings[which].true_depth(index)
-            if truth is not None and (truth > 0).mean() > _LEAST_KNOWN:
-                drawn = self._sample(self._recordings[which], self._poses[which], index, truth)
-                if drawn is not None:
-                    return drawn
-        raise TrainingError(f"no frame has dense depth and others at a useful distance: {_WANTED}")
-
-    def _sample(
-        self, recording: Recording, T_world_camera: NDArray[np.float64], index: int, truth: Array
-    ) -> Sample | None:
-        rng = self._rng
-        camera = recording.camera
-        height = _height(recording)
-        size = (WIDTH, height)
-        truth = np.asarray(cv2.resize(truth, size, interpolation=cv2.INTER_NEAREST_EXACT))
-        baselines = np.multiply(
-            _BASELINES, np.exp(rng.normal(0, _BASELINE_SPREAD, len(_BASELINES)))
-        )
-        chosen = neighbours(T_world_camera, index, baselines * np.median(truth[truth > 0]))
-        chosen = [n for n in chosen if rng.random() > _LEFT_OUT]
-        if not chosen:
-            return None
-        images = [recording.image(n, height, WIDTH) for n in (index, *chosen)]
-        guess = self._guess(images[0], truth)
-        if rng.random() < _WEATHER:
-            images = weathered(images, rng)
-        target, *others = (Appearance.of(_recorded(image, rng)) for image in images)
-        T_neighbour_target = np.linalg.inv(T_world_camera[chosen]) @ T_world_camera[index]
-        for T in T_neighbour_target:
-            turn, _ = cv2.Rodrigues(rng.normal(0, np.deg2rad(_TURN_ERROR_DEG), 3))
-            T[:3, :3] = T[:3, :3] @ turn
-            T[:3, 3] *= 1 + rng.normal(0, _LENGTH_ERROR)
-        K = camera.resized(WIDTH, height).K.astype(np.float64)
-        channels = evidence(measure(target, guess, others, K, T_neighbour_target))
-        is_known = truth > 0
-        wanted, (h, w) = np.log(guess / np.where(is_known, truth, FARTHEST_M)), CROP
-        top, left = (
-            int(rng.integers(have - need + 1)) for have, need in zip(channels.shape[1:], CROP)
-        )
-        at = slice(2 * top, 2 * (top + h)), slice(2 * left, 2 * (left + w))
-        part = channels[:, top : top + h, left : left + w]
-        return Sample(part.astype(np.float16), wanted[at].astype(np.float16), is_known[at])
-
-    def _guess(self, image: NDArray[np.uint8], truth: Array) -> Array:
-        """Learned depth with an error of its unit; often bent or blurred, as that of networks on unknown streets."""
-        rng = self._rng
-        height, width = truth.shape
-        depth = depth_at(self._networks.disparity(image), height, width)  # as a run has it
-        known = truth > 0
-        depth = depth * np.float32(
-            np.median(truth[known] / depth[known]) * np.exp(rng.normal(0, _SCALE_SPREAD))
-        )
-        if rng.random() < 0.6:
-            bend = rng.normal(0, rng.uniform(0.02, 0.2), (rng.integers(2, 6), rng.integers(3, 10)))
-            depth = depth * np.exp(
-                cv2.resize(bend.astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
-            )
-        if rng.random() < 0.4:
-            depth = 1 / cv2.GaussianBlur(1 / depth, (0, 0), rng.uniform(1, 4))
-        return np.asarray(depth, np.float32)
-
-
-def _height(recording: Recording) -> int:
-    """Of its images at ``WIDTH``."""
-    return round(recording.camera.height * WIDTH / recording.camera.width)
-
-
-def _recorded(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Grey, with the noise and the compression of a camera."""
-    grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.float32)
-    noisy = np.clip(grey + rng.normal(0, rng.uniform(0, 5), grey.shape), 0, 255).astype(np.uint8)
-    if rng.random() < 0.5:
-        return noisy
-    packed = cv2.imencode(".jpg", noisy, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(50, 95))])[1]
-    return np.asarray(cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE), np.uint8)
+    metrics = {f"{name}_mean": float(each.mean()) for name, each in all_errors.items()}
+    for name, each in all_errors.items():
+        metrics[f"{name}_median"] = float(each.median())
+    return metrics

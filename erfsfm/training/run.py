@@ -38,13 +38,14 @@ from erfsfm.data.prepared import write_prepared
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, by_label, labels_mb, stacked
 from erfsfm.data.split import split_recordings, usable
-from erfsfm.evaluation.protocols import many_view_protocol
+from erfsfm.evaluation.depth_protocols import many_view_protocol
 from erfsfm.inference import DepthPosePredictor, choose_device, has_bfloat16, learned_inverse_depth
 from erfsfm.model_record import find_weights, read_record
 from erfsfm.networks.lite0 import Lite0DepthNet
-from erfsfm.training.keeper import MEASUREMENTS, OutputFolder, StepProgress, WeightKeeper
+from erfsfm.training.keeper import StepProgress, WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses
+from erfsfm.training.output_folder import MEASUREMENTS, OutputFolder
 
 logger = logging.getLogger(__name__)
 

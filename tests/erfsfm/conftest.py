@@ -1,54 +1,23 @@
-"""A textured plane seen by a moving camera: exact images, depth and poses for every test of the networks."""
+"""Small drives and experiments for every test of the networks."""
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import small_drives
 import torch
-from numpy.typing import NDArray
+from small_drives import Plane
 
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.split import split_recordings
 from erfsfm.geometry import Camera
-
-RNG = np.random.default_rng(0)
-WAVES = RNG.uniform(-1.0, 1.0, (12, 2)) * 4.0
-PHASES = RNG.uniform(0, 2 * np.pi, (12, 3))
-
-
-@dataclass(frozen=True)
-class Plane:
-    """A plane z = ``distance`` in the first camera's frame, painted with smooth waves, at rest."""
-
-    camera: Camera
-    distance: float = 4.0
-
-    def points(self, t_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where each pixel's ray meets the plane ``(H, W, 2)``; the camera never rotates."""
-        v, u = np.mgrid[: self.camera.height, : self.camera.width].astype(np.float64)
-        depth = self.distance - t_world_camera[2]
-        x = (u - self.camera.cx) / self.camera.fx * depth + t_world_camera[0]
-        y = (v - self.camera.cy) / self.camera.fy * depth + t_world_camera[1]
-        return np.stack([x, y], axis=-1)
-
-    def colours(self, t_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The image ``(H, W, 3)`` in [0, 1]."""
-        angles = self.points(t_world_camera) @ WAVES.T  # (H, W, 12)
-        waves = np.cos(angles[..., None] + PHASES).mean(axis=2)  # (H, W, 3)
-        return 0.5 + 0.4 * np.clip(waves * 2, -1, 1)
-
-    def image(self, t_world_camera: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """The image ``(H, W, 3)`` uint8 RGB."""
-        return np.rint(self.colours(t_world_camera) * 255).astype(np.uint8)
 
 
 @pytest.fixture(autouse=True)
@@ -62,53 +31,10 @@ def plane() -> Plane:
     return Plane(Camera(width=96, height=64, fx=60.0, fy=62.0, cx=47.0, cy=30.0))
 
 
-WriteRoot = Callable[..., Path]
-
-
 @pytest.fixture
-def write_root() -> WriteRoot:
+def write_root() -> Callable[..., Path]:
     """Writes a KITTI odometry root of a drive towards the plane."""
-
-    def write(
-        root: Path,
-        frames: int = 8,
-        sequences: tuple[str, ...] = ("00",),
-        cameras: tuple[str, ...] = ("image_2",),
-        suffix: str = ".png",
-        seed: int | None = None,
-        depth: bool = False,
-        size: tuple[int, int] = (64, 96),
-        step: tuple[float, float, float] = (0.05, 0.0, 0.1),
-    ) -> Path:
-        scene = Plane(
-            Camera(size[1], size[0], 60.0, 62.0, (size[1] - 1) / 2, (size[0] - 1) / 2), 6.0
-        )
-        camera = scene.camera
-        row = f"{camera.fx} 0 {camera.cx} 0 0 {camera.fy} {camera.cy} 0 0 0 1 0"
-        for sequence in sequences:
-            home = root / "sequences" / sequence
-            home.mkdir(parents=True)
-            (home / "calib.txt").write_text("".join(f"P{k}: {row}\n" for k in range(4)))
-            (home / "times.txt").write_text("".join(f"{0.1 * k}\n" for k in range(frames)))
-            (root / "poses").mkdir(exist_ok=True)
-            places = np.arange(frames)[:, None] * np.array(step)
-            lines = [f"1 0 0 {x} 0 1 0 {y} 0 0 1 {z}\n" for x, y, z in places]
-            (root / "poses" / f"{sequence}.txt").write_text("".join(lines))
-            for folder in cameras:
-                (home / folder).mkdir()
-                for index, place in enumerate(places):
-                    image = scene.image(place + int(sequence) * 0.3)
-                    cv2.imwrite(str(home / folder / f"{index:06d}{suffix}"), image[..., ::-1])
-            if depth:
-                (home / "depth_2").mkdir()
-                for index, place in enumerate(places):
-                    encoded = np.full(size, (scene.distance - place[2]) * 256, dtype=np.uint16)
-                    cv2.imwrite(str(home / "depth_2" / f"{index:06d}.png"), encoded)
-        if seed is not None:
-            (root / "simulation.json").write_text(json.dumps({"seed": seed}))
-        return root
-
-    return write
+    return small_drives.write_root
 
 
 @pytest.fixture

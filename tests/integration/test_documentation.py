@@ -92,7 +92,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     ),
     (
         r"--truth many-views",
-        "it wants a drive; tests/erfsfm/evaluation/test_protocols.py has a short one",
+        "it wants a drive; tests/erfsfm/evaluation/test_depth_protocols.py has a short one",
     ),
     (r"mapping.voxel_size_m=0.1|make_figures.py ", "it wants frame 80 of KITTI's drive 0013"),
     (r"tools/reproduce.py ", "it trains the paper's networks"),

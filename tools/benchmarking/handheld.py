@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import functools
 from argparse import Namespace
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-import numpy as np
-from benchmarking.metrics import FRAMES, MetricDefinition, share
-from benchmarking.runs import BenchmarkSequence, Job, JobResult, simulated
+from benchmarking.definitions import MetricDefinition, share
+from benchmarking.metrics import FRAMES
+from benchmarking.runs import BenchmarkSequence, simulated
+from benchmarking.tracking import error_and_path, first_map, longest_wait, losses
 
-from slam.evaluation.trajectory import trajectory_metrics
-from slam.formats.trajectory import Trajectory
-from slam.results.folder import RunFolder
-from slam.sequences.catalogue import open_sequence, sequence_kinds
-from slam.sequences.poses import known_poses, poses_beside
-from slam.sequences.recording import RecordedSequence
+from slam.sequences.catalogue import sequence_kinds
+from slam.sequences.poses import poses_beside
 from slam.simulation.options import Motion, RoomHazard
 
 RoomCondition = Literal["clean"] | RoomHazard
@@ -35,6 +31,21 @@ MARKS = {
     "7-Scenes": "seq-01: 0.049 m on average; the reference itself is 0.014 to 0.15 m off COLMAP's",
     "EuRoC": "MH01 to MH05: 0.021 to 0.100 m (ORB-SLAM3)",
 }
+
+ATE = MetricDefinition("ATE 7-dof (m)", lambda o: None if o.reason else error_and_path(o.job)[0], 3)
+PATH = MetricDefinition("path (m)", lambda o: None if o.reason else error_and_path(o.job)[1], 1)
+PERCENT = share("7-dof, % of path", ATE, PATH, 100.0)
+LOSSES = MetricDefinition("losses", losses)
+FIRST_MAP = MetricDefinition("frames before the first map", first_map)
+NEW_MAP = MetricDefinition("most frames before a new map", longest_wait)
+LOCATED = share(
+    "share of frames located",
+    MetricDefinition("located", "tracking.located_frames"),
+    FRAMES,
+    1.0,
+    3,
+)
+DEFINITIONS = (ATE, PATH, PERCENT, LOSSES, FIRST_MAP, NEW_MAP, LOCATED)
 
 
 def add_options(add: Callable[..., Any]) -> None:
@@ -115,63 +126,3 @@ def drives(options: Namespace, folder: Path) -> list[BenchmarkSequence]:
         )
         found.append(simulated(folder, name, f"rooms, {rate} Hz", words, condition, hazards))
     return found
-
-
-@functools.cache
-def _error_and_path(job: Job) -> tuple[float | None, float | None]:
-    """7-dof ATE of the optimised trajectory, and the path, by those frames whose true pose is known, metres."""
-    drive = job.drive
-    sequence = open_sequence(drive.root, drive.sequence or None, truth=drive.truth)
-    poses = sequence.T_any_camera if isinstance(sequence, RecordedSequence) else None
-    known = np.zeros(0, np.intp) if poses is None else np.flatnonzero(known_poses(poses))
-    estimate = RunFolder(job.place).trajectory("optimised")
-    if poses is None or estimate is None or not len(known):
-        return None, None
-    truth = Trajectory(sequence.stamps[known], poses[known]).rebased()
-    ate: float | None = trajectory_metrics(
-        estimate.select(known).rebased(), truth
-    ).align.dof7.ate_rmse_m
-    return ate, truth.length_m
-
-
-def losses(o: JobResult) -> int | None:
-    """How often the camera was lost."""
-    events = o.metrics.tracking.events
-    return None if events is None else sum(each.event == "lost" for each in events)
-
-
-def first_map(o: JobResult) -> int | None:
-    """Number of frames before the first map."""
-    events = o.metrics.tracking.events or ()
-    return next((each.frame for each in events if each.event == "map begun"), None)
-
-
-def longest_wait(o: JobResult) -> int | None:
-    """Most frames from a loss until the camera was found again, or a new map began, or the recording ended."""
-    events, frames = o.metrics.tracking.events, o.metrics.sequence.frames
-    if events is None or frames is None:
-        return None
-    lost = [each.frame for each in events if each.event == "lost"]
-    found = [each.frame for each in events if each.event in ("map begun", "relocalised")]
-    waits = [
-        min((frame for frame in found if frame > start), default=frames) - start for start in lost
-    ]
-    return max(waits, default=None)
-
-
-ATE = MetricDefinition(
-    "ATE 7-dof (m)", lambda o: None if o.reason else _error_and_path(o.job)[0], 3
-)
-PATH = MetricDefinition("path (m)", lambda o: None if o.reason else _error_and_path(o.job)[1], 1)
-PERCENT = share("7-dof, % of path", ATE, PATH, 100.0)
-LOSSES = MetricDefinition("losses", losses)
-FIRST_MAP = MetricDefinition("frames before the first map", first_map)
-NEW_MAP = MetricDefinition("most frames before a new map", longest_wait)
-LOCATED = share(
-    "share of frames located",
-    MetricDefinition("located", "tracking.located_frames"),
-    FRAMES,
-    1.0,
-    3,
-)
-DEFINITIONS = (ATE, PATH, PERCENT, LOSSES, FIRST_MAP, NEW_MAP, LOCATED)

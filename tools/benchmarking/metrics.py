@@ -1,62 +1,12 @@
-"""The metrics of a run, its row in the CSV, and Markdown tables whose rows are groups of runs."""
+"""The metrics of a run, and its row in the CSV."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from operator import attrgetter
-from statistics import fmean, median, stdev
+from collections.abc import Sequence
 from typing import Any
 
+from benchmarking.definitions import MetricDefinition, share, stage_seconds
 from benchmarking.runs import JobResult, loops, revision
-
-from erfsfm.common.table import DASH, Table
-
-Label = Callable[[JobResult], str]
-Cell = Callable[[Sequence[JobResult]], str]
-drive, kind, weights = (
-    attrgetter("job.drive.name"),
-    attrgetter("job.drive.kind"),
-    attrgetter("job.weights"),
-)
-configuration = attrgetter("job.configuration")
-
-
-@dataclass(frozen=True)
-class MetricDefinition:
-    """A number of a run: its title in tables and in the CSV, its source, its decimals.
-
-    The source is its path in ``metrics.json`` as in `Metrics.at`, or a function of the run.
-    """
-
-    title: str
-    source: str | Callable[[JobResult], float | None]
-    decimals: int = 0
-
-    def value(self, o: JobResult) -> float | None:
-        """The number; None where it is not known."""
-        found: float | None = (
-            o.metrics.at(self.source)[0] if isinstance(self.source, str) else self.source(o)
-        )
-        return found
-
-
-def share(
-    title: str, part: MetricDefinition, whole: MetricDefinition, unit: float, decimals: int = 2
-) -> MetricDefinition:
-    """A part of a whole, in a unit."""
-
-    def value(o: JobResult) -> float | None:
-        of, total = part.value(o), whole.value(o)
-        return None if of is None or not total else unit * of / total
-
-    return MetricDefinition(title, value, decimals)
-
-
-def stage_seconds(o: JobResult, stage: str) -> float | None:
-    """Seconds of a stage of a run."""
-    return (o.metrics.timing.stages or {}).get(stage)
-
 
 FRAMES = MetricDefinition("frames", "sequence.frames")
 LENGTH = MetricDefinition("path (m)", "sequence.length_m")
@@ -145,58 +95,3 @@ def rows(
 def stages(results: Sequence[JobResult]) -> list[str]:
     """Every stage that some run went through, in order of appearance."""
     return list(dict.fromkeys(stage for o in results for stage in o.metrics.timing.stages or ()))
-
-
-def table(
-    rows: Mapping[str, Label], columns: Mapping[str, Cell], results: Sequence[JobResult]
-) -> str:
-    """Markdown: one row for each group of results that share their labels."""
-    groups = grouped(results, *rows.values()).items()
-    cells = [[*label, *(cell(group) for cell in columns.values())] for label, group in groups]
-    return Table([*rows, *columns], cells, names=len(rows)).markdown()
-
-
-def grouped(results: Sequence[JobResult], *labels: Label) -> dict[tuple[str, ...], list[JobResult]]:
-    """Results grouped by their labels, in order of appearance."""
-    groups: dict[tuple[str, ...], list[JobResult]] = {}
-    for o in results:
-        groups.setdefault(tuple(label(o) for label in labels), []).append(o)
-    return groups
-
-
-def over_seeds(definition: MetricDefinition) -> Cell:
-    """Mean and, where it is not zero, sample standard deviation."""
-
-    def cell(group: Sequence[JobResult]) -> str:
-        found = values(group, definition)
-        deviation = round(stdev(found), definition.decimals) if len(found) > 1 else 0.0
-        return mean(found, definition.decimals) + (
-            f" ± {deviation:.{definition.decimals}f}" if deviation else ""
-        )
-
-    return cell
-
-
-def middle_and_extreme(
-    definition: MetricDefinition, extreme: Callable[[Sequence[float]], float]
-) -> Cell:
-    """Median and the largest or smallest value of a group."""
-    return lambda group: spread(values(group, definition), definition.decimals, extreme)
-
-
-def spread(
-    found: Sequence[float], decimals: int, extreme: Callable[[Sequence[float]], float]
-) -> str:
-    """Median and the largest or smallest of some numbers."""
-    return f"{median(found):.{decimals}f} ({extreme(found):.{decimals}f})" if found else DASH
-
-
-def values(results: Sequence[JobResult], definition: MetricDefinition) -> list[float]:
-    """The values of a metric, without the results that lack it."""
-    found = (definition.value(o) for o in results)
-    return [value for value in found if value is not None]
-
-
-def mean(found: Sequence[float], decimals: int) -> str:
-    """Mean of some numbers."""
-    return f"{fmean(found):.{decimals}f}" if found else DASH

@@ -12,18 +12,23 @@ from pathlib import Path
 import numpy as np
 from benchmarking import handheld
 from benchmarking import metrics as m
-from benchmarking.metrics import (
+from benchmarking.definitions import MetricDefinition
+from benchmarking.runs import EVERYTHING, FALSE_DEG, FALSE_M, JobResult, revision
+from benchmarking.tables import (
     Cell,
-    MetricDefinition,
+    Label,
+    configuration,
     drive,
     grouped,
     kind,
+    mean,
+    middle_and_extreme,
     over_seeds,
+    spread,
     table,
     values,
     weights,
 )
-from benchmarking.runs import EVERYTHING, FALSE_DEG, FALSE_M, JobResult, revision
 from make_figures import draw_trajectories, trajectories_of
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -80,7 +85,7 @@ Every drive:
 
 def maps_tables(results: Sequence[JobResult]) -> str:
     """Errors of the map with everything on and with one part turned off; sizes and cost."""
-    rows = {"sequence": drive, "weights": weights, "configuration": m.configuration}
+    rows = {"sequence": drive, "weights": weights, "configuration": configuration}
     whole = [o for o in results if o.job.configuration == EVERYTHING]
     costs = (*m.MAP_SIZES, m.FUSION, m.MESH, m.MEMORY)
     sizes = table(
@@ -116,19 +121,19 @@ def handheld_summary(results: Sequence[JobResult]) -> str:
     """One row for each kind of recording and weights."""
     columns: dict[str, Cell] = {
         **_COUNTS,
-        "mean ATE 7-dof (m)": lambda group: m.mean(
+        "mean ATE 7-dof (m)": lambda group: mean(
             values(group, handheld.ATE), handheld.ATE.decimals
         ),
-        "ATE 7-dof, % of path: median (worst)": m.middle_and_extreme(handheld.PERCENT, max),
+        "ATE 7-dof, % of path: median (worst)": middle_and_extreme(handheld.PERCENT, max),
         "losses in all": lambda group: (
             f"{sum(lost):.0f}" if (lost := values(group, handheld.LOSSES)) else DASH
         ),
-        "frames before the first map": m.middle_and_extreme(handheld.FIRST_MAP, max),
-        "before a new map": m.middle_and_extreme(handheld.NEW_MAP, max),
-        "share of frames located": m.middle_and_extreme(handheld.LOCATED, min),
-        "CPU ms / frame": m.middle_and_extreme(m.CPU, max),
+        "frames before the first map": middle_and_extreme(handheld.FIRST_MAP, max),
+        "before a new map": middle_and_extreme(handheld.NEW_MAP, max),
+        "share of frames located": middle_and_extreme(handheld.LOCATED, min),
+        "CPU ms / frame": middle_and_extreme(m.CPU, max),
     }
-    rows: dict[str, m.Label] = {
+    rows: dict[str, Label] = {
         "recordings": kind,
         "weights": weights,
         "published": lambda o: handheld.MARKS.get(kind(o), DASH),
@@ -147,7 +152,9 @@ TABLES: dict[str, Callable[[Sequence[JobResult]], str]] = {
 def notes(results: Sequence[JobResult], definitions: Iterable[MetricDefinition]) -> str:
     """Leaks, reasons of missing numbers, and failed runs, a line each."""
     lines: dict[str, None] = {}
-    for o in (o for o in results if not o.reason):
+    for o in results:
+        if o.reason:
+            continue
         if o.metrics.provenance.leak is True:
             lines[
                 f"LEAK: weights {o.job.weights} saw frames of {o.job.drive.name} in training."
@@ -197,33 +204,26 @@ def with_section(page: str, new: str) -> str:
     sections = {text.splitlines()[0]: text.strip() + "\n" for text in [*old, new]}
     order = [f"## {mode.capitalize()}" for mode in (*TABLES, "speed")]
     place = {title: number for number, title in enumerate(order)}
-    return "\n".join(
-        [
-            PAGE,
-            *(
-                sections[title]
-                for title in sorted(sections, key=lambda t: place.get(t, len(order)))
-            ),
-        ]
-    )
+    titles = sorted(sections, key=lambda title: place.get(title, len(order)))
+    return "\n".join([PAGE, *(sections[title] for title in titles)])
 
 
 def summary_table(results: Sequence[JobResult]) -> str:
     """One row for each kind of drive and weights; every number is over all of its runs."""
     columns: dict[str, Cell] = {
         **_COUNTS,
-        "ATE 7-dof, % of path: median (worst)": m.middle_and_extreme(m.PERCENT, max),
-        "ATE 6-dof, % of path": m.middle_and_extreme(m.PERCENT_6, max),
-        "the network's": m.middle_and_extreme(m.NETWORK_PERCENT, max),
-        "over the network's": m.middle_and_extreme(m.OF_NETWORK, max),
+        "ATE 7-dof, % of path: median (worst)": middle_and_extreme(m.PERCENT, max),
+        "ATE 6-dof, % of path": middle_and_extreme(m.PERCENT_6, max),
+        "the network's": middle_and_extreme(m.NETWORK_PERCENT, max),
+        "over the network's": middle_and_extreme(m.OF_NETWORK, max),
         "over the clean drive's": against_clean(results),
         "drives with a true loop": lambda group: (
             f"{sum(n > 0 for n in values(group, m.TRUE_LOOPS))} of {len(group)}"
         ),
         "false loops": lambda group: f"{sum(values(group, m.FALSE_LOOPS)):.0f}",
-        "frames / s": m.middle_and_extreme(m.RATE, min),
-        "CPU ms / frame": m.middle_and_extreme(m.CPU, max),
-        "peak RSS (MiB)": m.middle_and_extreme(m.MEMORY, max),
+        "frames / s": middle_and_extreme(m.RATE, min),
+        "CPU ms / frame": middle_and_extreme(m.CPU, max),
+        "peak RSS (MiB)": middle_and_extreme(m.MEMORY, max),
     }
     return table({"drives": kind, "weights": weights}, columns, results)
 
@@ -237,15 +237,14 @@ def against_clean(results: Sequence[JobResult]) -> Cell:
     by_run = {key(o.job.drive.name, o): o for o in results}
 
     def cell(group: Sequence[JobResult]) -> str:
-        twins = [
-            (o, by_run[key(o.job.drive.clean, o)])
-            for o in group
-            if key(o.job.drive.clean, o) in by_run
-        ]
-        pairs = [(values([o], m.ATE_7), values([twin], m.ATE_7)) for o, twin in twins]
-        return m.spread(
-            [ate / clean for [ate], [clean] in (p for p in pairs if all(p)) if clean > 0], 2, max
-        )
+        ratios = []
+        for o in group:
+            twin = by_run.get(key(o.job.drive.clean, o))
+            ate = m.ATE_7.value(o)
+            clean = None if twin is None else m.ATE_7.value(twin)
+            if ate is not None and clean is not None and clean > 0:
+                ratios.append(ate / clean)
+        return spread(ratios, 2, max)
 
     return cell
 

@@ -1,26 +1,22 @@
-"""The runs of a benchmark: recordings, configurations, their combinations, what came out; two checkouts in turn."""
+"""The runs of a benchmark: recordings, configurations, their combinations, what came out."""
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
 from pathlib import Path
-from statistics import median
 from typing import Literal, get_args
 
 import numpy as np
 
 from erfsfm.common.processes import slam_process
 from erfsfm.common.progress import progress_bar
-from erfsfm.common.table import Table
 from slam.commands.batch import Drive, run_drives
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.results.folder import RunFolder
@@ -34,6 +30,20 @@ ROOT = Path(__file__).resolve().parents[2]
 SOURCES = ("erfsfm", "slam", "configs")  # folders that results depend on
 BULKY = (MAP_MESH, MAP_CLOUD, PLACES, GRAPH)  # removed after a run: no table reads them
 FALSE_M, FALSE_DEG = 2.0, 5.0  # a loop with a larger error is false
+
+QUIET = ("output.report=false",)
+EVERYTHING = "everything on"
+# overrides of a run by the name of its configuration
+ACCURACY: dict[str, tuple[str, ...]] = {"default": QUIET}
+MAPS: dict[str, tuple[str, ...]] = {
+    EVERYTHING: QUIET,
+    "depth not refined": (*QUIET, "depth.refine=none"),
+    "range to 30 m": (*QUIET, "mapping.depth_max_m=30"),
+    "holes left open": (*QUIET, "mapping.close_holes_m=0"),
+    "no loops": (*QUIET, "loops.enabled=false"),
+}
+# stretches of KITTI odometry at the size of its cameras, in a folder of recordings as the tests use it
+ORIGINALS = ("kitti_odometry_original", "failures/kitti03_full")
 
 
 @dataclass(frozen=True)
@@ -52,21 +62,6 @@ class BenchmarkSequence:
     kind: str = ""
     clean: str = ""
     truth: Path | None = None
-
-
-QUIET = ("output.report=false",)
-EVERYTHING = "everything on"
-# overrides of a run by the name of its configuration
-ACCURACY: dict[str, tuple[str, ...]] = {"default": QUIET}
-MAPS: dict[str, tuple[str, ...]] = {
-    EVERYTHING: QUIET,
-    "depth not refined": (*QUIET, "depth.refine=none"),
-    "range to 30 m": (*QUIET, "mapping.depth_max_m=30"),
-    "holes left open": (*QUIET, "mapping.close_holes_m=0"),
-    "no loops": (*QUIET, "loops.enabled=false"),
-}
-# stretches of KITTI odometry at the size of its cameras, in a folder of recordings as the tests use it
-ORIGINALS = ("kitti_odometry_original", "failures/kitti03_full")
 
 
 @dataclass(frozen=True)
@@ -122,12 +117,11 @@ def plan(
     device: str,
 ) -> list[Job]:
     """Every combination, configuration by configuration."""
-    return [
-        Job(folder, drive, each, name, (*overrides, *changes), seed, device)
-        for (name, overrides), seed, each, drive in product(
-            configurations.items(), seeds, weights, drives
-        )
-    ]
+    jobs = []
+    for name, seed, each, drive in product(configurations, seeds, weights, drives):
+        overrides = (*configurations[name], *changes)
+        jobs.append(Job(folder, drive, each, name, overrides, seed, device))
+    return jobs
 
 
 def worlds(
@@ -244,75 +238,3 @@ def is_false(T_from_to: FloatArray, T_world_from: FloatArray, T_world_to: FloatA
 def slug(text: str) -> str:
     """A name for files and columns."""
     return re.sub(r"[^\w.]+", "-", text).strip("-")
-
-
-Cost = dict[str, float]  # of a run, by column
-Costs = dict[str, dict[str, Cost]]  # medians by drive and checkout
-COLUMNS = ("CPU ms / frame", "ms / frame", "peak RSS (MiB)")  # before the stages, ms a frame each
-
-
-def in_turn(
-    checkouts: Mapping[str, Path], drives: Mapping[str, Sequence[str]], pairs: int, output: Path
-) -> Costs:
-    """The costs of each drive, arguments of ``erfsfm-slam run``, by each of two checkouts; every run is a new one.
-
-    Raises:
-        SystemExit: a run failed.
-    """
-    costs: Costs = {}
-    for row, (drive, arguments) in enumerate(drives.items()):
-        runs: dict[str, list[Cost]] = {commit: [] for commit in checkouts}
-        for pair in range(pairs):
-            for column, (commit, checkout) in enumerate(checkouts.items()):
-                runs[commit].append(_cost(checkout, arguments, output / f"{row}-{pair}-{column}"))
-                print(
-                    f"{drive}, {commit}: {runs[commit][-1][COLUMNS[0]]:.1f} ms a frame",
-                    file=sys.stderr,
-                )
-        costs[drive] = {
-            commit: {key: median(each.get(key, 0.0) for each in found) for key in found[0]}
-            for commit, found in runs.items()
-        }
-    return costs
-
-
-def tables(costs: Costs) -> str:
-    """Costs and their ratios, then the stages, in Markdown."""
-    before, after = next(iter(costs.values()))
-    stages = list(
-        dict.fromkeys(key for pair in costs.values() for cost in pair.values() for key in cost)
-    )
-    stages = stages[len(COLUMNS) :]
-    rows, by_stage = [], []
-    for drive, pair in costs.items():
-        both = [[cost[key] for cost in pair.values()] for key in COLUMNS]
-        rows.append([drive, *(f"{old:.0f}, {new:.0f}: **{new / old:.2f}**" for old, new in both)])
-        by_stage += [
-            [drive, c, *(f"{cost.get(stage, 0.0):.1f}" for stage in stages)]
-            for c, cost in pair.items()
-        ]
-    return f"""Medians of {before}, of {after}: and their ratio.
-
-{Table(["drive", *COLUMNS], rows).markdown()}
-
-Time that the main thread spends in or waits for each stage, ms a frame:
-
-{Table(["drive", "commit", *stages], by_stage, names=2).markdown()}"""
-
-
-def _cost(checkout: Path, arguments: Sequence[str], output: Path) -> Cost:
-    log = output.with_suffix(".log")
-    words, variables = ["run", *arguments, "--output", str(output)], {"PYTHONPATH": str(checkout)}
-    reason = slam_process(words, checkout, log, variables=variables)
-    if reason:
-        raise SystemExit(f"{' '.join(arguments)} by {checkout} failed: {reason}; see {log}")
-    tree = json.loads((output / METRICS).read_text(encoding="utf-8"))
-    timing, ms = tree["timing"], 1e3 / tree["sequence"]["frames"]
-    measured = (
-        ms * timing["cpu_seconds"],
-        1e3 / timing["frames_per_second"],
-        timing["peak_rss_mb"],
-    )
-    return dict(zip(COLUMNS, measured)) | {
-        stage: ms * seconds for stage, seconds in timing["stages"].items()
-    }

@@ -21,6 +21,15 @@ HIGHEST_M = 1000.0
 _USUAL_HEIGHTS_M = (0.1, 10.0)
 _COEFFICIENTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,), "fov": (1,)}
 
+# of the longer side of the image: a circular fisheye has 0.15, a telephoto lens of 3 degrees 20
+FOCAL_RATIO_LIMITS = (0.1, 20.0)
+# pixels: OpenCV resamples no longer sides; 64 million are more than the sensors of cameras have
+_SIDE_LIMITS = (8, 32766)
+MOST_PIXELS = 2**26
+# of the image's size; the principal points of the KITTI cameras are within 0.05
+_CENTRE_TOLERANCE = 0.2
+_PIXEL_ASPECT_TOLERANCE = 0.1  # pixels of PAL video are 1.09 times as wide as they are high
+
 
 class CameraFile(BaseModel):
     """The keys of ``camera.yaml``; (0, 0) is the centre of the top-left pixel."""
@@ -133,17 +142,6 @@ def camera_of(keys: dict[str, Any], where: str) -> CameraFile:
             height_m,
         )
     return camera
-
-
-# of the longer side of the image: a circular fisheye has 0.15, a telephoto lens of 3 degrees 20
-FOCAL_RATIO_LIMITS = (0.1, 20.0)
-# pixels: OpenCV resamples no longer sides; 64 million are more than the sensors of cameras have
-_SIDE_LIMITS = (8, 32766)
-MOST_PIXELS = 2**26
-_CENTRE_TOLERANCE = (
-    0.2  # of the image's size; the principal points of the KITTI cameras are within 0.05
-)
-_PIXEL_ASPECT_TOLERANCE = 0.1  # pixels of PAL video are 1.09 times as wide as they are high
 
 
 @dataclass(frozen=True)

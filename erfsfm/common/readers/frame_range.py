@@ -74,9 +74,13 @@ class FrameRange:
 
 def overlapping(names: Iterable[str], seen: Iterable[str]) -> list[str]:
     """Those of ``names`` that share frames with what was ``seen`` in training; empty where nothing leaks."""
-    ranges = [FrameRange.parse(name) for name in seen]
-    wanted = [(name, FrameRange.parse(name)) for name in names]
-    return [name for name, frames in wanted if any(frames.covers(each) for each in ranges)]
+    ranges = list(map(FrameRange.parse, seen))
+    found = []
+    for name in names:
+        frames = FrameRange.parse(name)
+        if any(map(frames.covers, ranges)):
+            found.append(name)
+    return found
 
 
 def merge(names: Iterable[str]) -> list[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import re
-from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -53,7 +52,12 @@ def list_images(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     paths = [path for path in folder.iterdir() if is_image(path)]
-    doubles = [stem for stem, count in Counter(p.stem for p in paths).items() if count > 1]
+    stems: set[str] = set()
+    doubles: set[str] = set()
+    for path in paths:
+        if path.stem in stems:
+            doubles.add(path.stem)
+        stems.add(path.stem)
     if doubles:
         raise DataError(f"{folder} has image {min(doubles)} in two formats: keep one file a frame")
     return sorted(paths, key=natural_key)
@@ -61,7 +65,7 @@ def list_images(folder: Path) -> list[Path]:
 
 def has_images(folder: Path) -> bool:
     """Whether a folder holds an image file, without listing all of it."""
-    return folder.is_dir() and any(is_image(path) for path in folder.iterdir())
+    return folder.is_dir() and any(map(is_image, folder.iterdir()))
 
 
 def image_folder(folder: Path) -> Path | None:
@@ -91,8 +95,11 @@ def natural_key(path: Path) -> list[tuple[Decimal, str]]:
 
     A point belongs to a number that ends the name and stands alone: not in ``cam0.12.png``.
     """
-    texts_and_numbers = enumerate(_NUMBER.split(path.name))
-    return [(Decimal(part if place % 2 else 0), part) for place, part in texts_and_numbers]
+    key = []
+    for place, part in enumerate(_NUMBER.split(path.name)):
+        is_number = place % 2 == 1
+        key.append((Decimal(part if is_number else 0), part))
+    return key
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,31 @@ ODOMETRY_DRIVES = {
     "10": ("2011_09_30_drive_0034", 0, 1201),
 }
 
+ODOMETRY_CALIBRATION = "calib.txt"
+CAM_TO_CAM = "calib_cam_to_cam.txt"
+VELO_TO_CAM = "calib_velo_to_cam.txt"
+IMU_TO_VELO = "calib_imu_to_velo.txt"
+_SHIPPED = {
+    ODOMETRY_CALIBRATION: "with the odometry images (data_odometry_calib.zip); copy it there",
+    **dict.fromkeys(
+        (CAM_TO_CAM, VELO_TO_CAM, IMU_TO_VELO), "as DATE_calib.zip; copy it beside the drives"
+    ),
+}
+ASPECT_TOLERANCE = 0.01
+CAMERA_HEIGHT_M = 1.65  # of the car's cameras above the road
+_SCALE_TOLERANCE = 0.15  # of a principal point from the middle, along both axes
+
+# packets of the GPS/INS
+_COLUMNS = 30
+VELOCITY_NORTH = 6  # columns, m/s
+VELOCITY_EAST = 7
+VELOCITY_UP = 10
+
+# scans
+VELODYNE_COLUMNS = 4
+_FARTHEST_M = 1e4
+_MOST_BYTES = 2**28  # 16 million points of four numbers
+
 
 @dataclass(frozen=True)
 class OdometryRoot:
@@ -56,7 +81,7 @@ class OdometryRoot:
 
     def folders(self) -> list[Path]:
         """The folder of every sequence, in natural order."""
-        return sorted((p for p in self.sequences.iterdir() if p.is_dir()), key=natural_key)
+        return sorted(filter(Path.is_dir, self.sequences.iterdir()), key=natural_key)
 
     def names(self) -> list[str]:
         """Sequences that have images."""
@@ -92,9 +117,10 @@ def find_odometry_root(dataset: Path) -> OdometryRoot | None:
 
 def odometry_camera(folder: Path) -> int | None:
     """The camera of a sequence to use: colour before grey, left before right; None without any images."""
-    return next(
-        (camera for camera in ODOMETRY_CAMERAS if has_images(folder / f"image_{camera}")), None
-    )
+    for camera in ODOMETRY_CAMERAS:
+        if has_images(folder / f"image_{camera}"):
+            return camera
+    return None
 
 
 def find_drives(dataset: Path) -> dict[str, Path]:
@@ -123,23 +149,6 @@ def drive_name(text: str) -> str:
     return Path(text).name.removesuffix("_sync")
 
 
-ODOMETRY_CALIBRATION = "calib.txt"
-CAM_TO_CAM, VELO_TO_CAM, IMU_TO_VELO = (
-    "calib_cam_to_cam.txt",
-    "calib_velo_to_cam.txt",
-    "calib_imu_to_velo.txt",
-)
-_SHIPPED = {
-    ODOMETRY_CALIBRATION: "with the odometry images (data_odometry_calib.zip); copy it there",
-    **dict.fromkeys(
-        (CAM_TO_CAM, VELO_TO_CAM, IMU_TO_VELO), "as DATE_calib.zip; copy it beside the drives"
-    ),
-}
-ASPECT_TOLERANCE = 0.01
-CAMERA_HEIGHT_M = 1.65  # of the car's cameras above the road
-_SCALE_TOLERANCE = 0.15  # of a principal point from the middle, along both axes
-
-
 class CalibrationFile:
     """The numeric rows of one calibration file."""
 
@@ -156,8 +165,11 @@ class CalibrationFile:
             text = read_text(path)
         except (OSError, UnicodeDecodeError) as error:
             raise DataError(f"cannot read calibration {path}: {error}") from error
-        rows = [line.partition(":") for line in text.splitlines() if line.strip()]
-        self._rows = {key.strip(): value.split() for key, _, value in rows}
+        self._rows: dict[str, list[str]] = {}
+        for line in text.splitlines():
+            if line.strip():
+                key, _, value = line.partition(":")
+                self._rows[key.strip()] = value.split()
 
     def __contains__(self, key: str) -> bool:
         """Whether the file has a row of this name."""
@@ -172,7 +184,7 @@ class CalibrationFile:
                 f"no row {key} in {self.path}: found {', '.join(self._rows) or 'nothing'}"
             )
         try:
-            numbers = np.array([float(word) for word in words])
+            numbers = np.array(list(map(float, words)))
         except ValueError as error:
             raise DataError(f"{self.path} row {key}: {error}; it needs {count} numbers") from error
         if len(numbers) != count or not np.isfinite(numbers).all():
@@ -202,8 +214,8 @@ class CalibrationFile:
         """
         camera = self._pinhole(key, width, height)
         scales = 2 * (camera.cx + 0.5) / width, 2 * (camera.cy + 0.5) / height
-        both_off = all(abs(scale - 1) > _SCALE_TOLERANCE for scale in scales)
-        if not all(0.5 < scale < 1.5 for scale in scales) or (
+        both_off = min(abs(scale - 1) for scale in scales) > _SCALE_TOLERANCE
+        if not 0.5 < min(scales) <= max(scales) < 1.5 or (
             both_off and abs(scales[0] / scales[1] - 1) < _SCALE_TOLERANCE
         ):
             raise DataError(
@@ -231,7 +243,7 @@ class CalibrationFile:
 
     def _pinhole(self, key: str, width: int, height: int) -> Pinhole:
         P = self.matrix(key, (3, 4))
-        fx, fy, cx, cy = (float(value) for value in (P[0, 0], P[1, 1], P[0, 2], P[1, 2]))
+        fx, fy, cx, cy = map(float, (P[0, 0], P[1, 1], P[0, 2], P[1, 2]))
         skew_free = P[0, 1] == P[1, 0] == P[2, 0] == P[2, 1] == 0 and P[2, 2] == 1
         if not (fx > 0 and fy > 0 and skew_free):
             raise DataError(
@@ -246,17 +258,10 @@ def _rigid(R_a_b: FloatArray, t_a_b: FloatArray) -> FloatArray:
     return T_a_b
 
 
-VELOCITY_NORTH, VELOCITY_EAST, VELOCITY_UP = 6, 7, 10  # columns, m/s
-_COLUMNS = 30
-VELODYNE_COLUMNS = 4
-_FARTHEST_M = 1e4
-_MOST_BYTES = 2**28  # 16 million points of four numbers
-
-
 def read_packet(path: Path) -> FloatArray:
     """One packet ``(30,)``."""
     try:
-        row = [float(word) for word in read_text(path).split()]
+        row = list(map(float, read_text(path).split()))
     except (OSError, ValueError) as error:
         raise DataError(f"cannot read OXTS packet {path}: {error}") from error
     if len(row) != _COLUMNS or not np.isfinite(row).all():

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -39,12 +40,16 @@ class NumberedFiles:
 
     def gaps(self) -> list[tuple[int, int]]:
         """Runs of rows without a file, as (first, last)."""
-        return [(a + 1, b - 1) for a, b in zip(self.rows, self.rows[1:]) if b > a + 1]
+        gaps = []
+        for before, after in pairwise(self.rows):
+            if after > before + 1:
+                gaps.append((before + 1, after - 1))
+        return gaps
 
     def parts(self) -> list[tuple[int, int]]:
         """Runs of files without a gap between them, as half-open ranges of positions in ``paths``."""
-        cuts = [k for k in range(1, len(self.rows)) if self.rows[k] > self.rows[k - 1] + 1]
-        return list(zip([0, *cuts], [*cuts, len(self.rows)]))
+        cuts = 1 + np.flatnonzero(np.diff(self.rows) > 1)
+        return list(pairwise([0, *cuts.tolist(), len(self.rows)]))
 
     def file_name(self, row: int) -> str:
         """The name that the file of a row has or would have."""
@@ -72,7 +77,7 @@ class NumberedFiles:
     def describe_gaps(self) -> str:
         """How many files are missing, and which first."""
         gaps = self.gaps()
-        missing = sum(last - first + 1 for first, last in gaps)
+        missing = len(self) - len(self.paths)
         first, last = gaps[0]
         where = self.file_name(first) + (f" to {self.file_name(last)}" if last > first else "")
         return f"{missing} of {len(self)} frames have no image; the first gap is {where}"
@@ -93,14 +98,15 @@ def by_name(paths: list[Path]) -> NumberedFiles:
 
     Names without a number at their end, stamps and every-n-th-frame numbering have no gaps.
     """
-    matches = [_NUMBERED.fullmatch(path.stem) for path in paths]
-    numbers = [int(match["number"]) for match in matches if match is not None]
-    prefixes = {None if match is None else match["prefix"] for match in matches}
-    if (
-        None in prefixes
-        or len(prefixes) > 1
-        or (len(numbers) > 1 and np.median(np.diff(numbers)) != 1)
-    ):
+    numbers: list[int] = []
+    prefixes: set[str] = set()
+    for path in paths:
+        match = _NUMBERED.fullmatch(path.stem)
+        if match is None:
+            return in_order(paths)
+        numbers.append(int(match["number"]))
+        prefixes.add(match["prefix"])
+    if len(prefixes) > 1 or (len(numbers) > 1 and np.median(np.diff(numbers)) != 1):
         return in_order(paths)
     return replace(_numbered(paths, numbers), first=0)
 
@@ -120,10 +126,10 @@ def by_table(listed: list[Path], table: Path) -> NumberedFiles:
         raise DataError(
             f"none of the {len(listed)} images that {table} names is there: unpack them"
         )
-    names = tuple(path.name for path in listed[there[0] : there[-1] + 1])
-    return NumberedFiles(
-        tuple(listed[row] for row in there), tuple(row - there[0] for row in there), there[0], names
-    )
+    first = there[0]
+    names = tuple(path.name for path in listed[first : there[-1] + 1])
+    paths = tuple(listed[row] for row in there)
+    return NumberedFiles(paths, tuple((np.array(there) - first).tolist()), first, names)
 
 
 def _numbered(paths: list[Path], numbers: list[int]) -> NumberedFiles:

@@ -147,10 +147,13 @@ def _packet_times(path: Path) -> NDArray[np.float64] | None:
 
 def list_videos(folder: Path) -> list[Path]:
     """The video files directly in a folder, without hidden ones."""
-    visible = (path for path in folder.iterdir() if not path.name.startswith("."))
-    return sorted(
-        path for path in visible if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
-    )
+
+    found = []
+    for path in folder.iterdir():
+        is_video = path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
+        if is_video and not path.name.startswith("."):
+            found.append(path)
+    return sorted(found)
 
 
 def video_name(video: Path) -> str:

@@ -12,8 +12,11 @@ import pytest
 import yaml
 
 from erfsfm.common.errors import DataError
-from erfsfm.data.discovery import discover, open_drive
+from erfsfm.data.discovery import INDOOR_HEIGHT_M, discover, open_drive
 from erfsfm.data.recordings import Recording
+from slam.simulation.kitti_layout import write_kitti_root
+from slam.simulation.options import SimulationOptions
+from slam.simulation.rooms import SimulatedRooms
 
 CAMERA = {"width": 48, "height": 32, "fx": 40.0, "fy": 41.0, "cx": 23.5, "cy": 15.5, "fps": 10}
 
@@ -81,6 +84,14 @@ def test_simulated_root_is_named_by_its_seed(
     assert depth is not None
     assert depth.dtype == np.float32
     assert float(depth[0, 0]) == pytest.approx(5.9, abs=1 / 256)
+
+
+def test_rooms_are_exact_in_a_unit_of_their_own(tmp_path: Path) -> None:
+    rooms = SimulatedRooms(SimulationOptions("rooms", 2, 0, 64, 48))
+    write_kitti_root(rooms, tmp_path / "rooms", depth=True)
+    (recording,) = discover(tmp_path / "rooms")
+    assert recording.exact
+    assert recording.camera_height_m == INDOOR_HEIGHT_M
 
 
 def test_poses_and_parts(tmp_path: Path, write_root: Callable[..., Path]) -> None:

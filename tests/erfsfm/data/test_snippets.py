@@ -1,9 +1,10 @@
-"""Draws, windows, validation, the split of recordings, and split files."""
+"""Draws, windows, validation, and labels: exact depth, and depth of a network as the label of another one."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,22 +13,27 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.frame_range import overlapping
-from erfsfm.config import DataConfig, ExperimentConfig, TeacherConfig
+from erfsfm.config import ExperimentConfig, TeacherConfig
 from erfsfm.data.augmentation import FOCAL_LENGTH
-from erfsfm.data.discovery import discover
-from erfsfm.data.snippets import SnippetDraws, ValidationSnippets
-from erfsfm.data.split import Split, read_split_file, split_recordings
-from erfsfm.data.window import snippet_motion
+from erfsfm.data.discovery import INDOOR_HEIGHT_M, discover
+from erfsfm.data.many_view_teacher import ManyViewTeacher
+from erfsfm.data.snippets import FARTHEST_M, SnippetDraws, ValidationSnippets, chances, stacked
+from erfsfm.data.split import split_recordings
+from erfsfm.data.window import HEIGHTS, snippet_motion
+from erfsfm.inference import DepthPosePredictor, learned_inverse_depth
+from erfsfm.model_record import find_weights, read_record
+from erfsfm.training.run import prepare, train
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 
 FRAMES = 9
+SIZE = (64, 96)
 
 
 def experiment(batch: int = 2, sources: int = 2, devices: int = 1, **data: Any) -> ExperimentConfig:
@@ -219,109 +225,6 @@ def test_validation_truth(tmp_path: Path, write_root: Callable[..., Path]) -> No
     torch.testing.assert_close(T_source_target[:, 2, 3], 0.1 * steps)
 
 
-# the split of recordings
-
-
-def names(config: DataConfig) -> tuple[list[str], list[str]]:
-    training, validation = split_recordings(config)
-    return [r.frames_name for r in training], [r.frames_name for r in validation]
-
-
-@pytest.fixture
-def kitti(tmp_path: Path, write_root: Callable[..., Path]) -> Path:
-    return write_root(tmp_path / "kitti", frames=6, sequences=("00", "03", "09", "10"), size=(8, 8))
-
-
-def test_test_sequences_are_never_trained_on(kitti: Path) -> None:
-    assert names(DataConfig(roots=[kitti])) == (["kitti_odometry/00[0:6]"], [])
-
-
-def test_a_misspelt_kind_is_not_left_in_the_training(kitti: Path) -> None:
-    with pytest.raises(DataError, match=r"data\.exclude names 'simulatd/3'"):
-        split_recordings(DataConfig(roots=[kitti], exclude=["simulatd/3"]))
-
-
-def test_ranges_and_parts_that_are_excluded(kitti: Path) -> None:
-    """The frames around such a part train."""
-    training, _ = names(DataConfig(roots=[kitti], ranges={"kitti_odometry/00": "1:4"}, exclude=[]))
-    assert training[0] == "kitti_odometry/00[1:4]" and len(training) == 4
-    held_back = [
-        "kitti_raw/2011_10_03_drive_0027[2:4]",
-        "kitti_odometry/03",
-        "kitti_odometry/09",
-        "kitti_odometry/10",
-    ]
-    config = DataConfig(roots=[kitti], exclude=held_back)
-    assert names(config)[0] == ["kitti_odometry/00[0:2]", "kitti_odometry/00[4:6]"]
-    config = DataConfig(roots=[kitti], exclude=held_back, ranges={"kitti_odometry/00": "0:3"})
-    assert names(config)[0] == ["kitti_odometry/00[0:2]"]
-
-
-def test_validation_recordings_only_validate(
-    tmp_path: Path, write_root: Callable[..., Path]
-) -> None:
-    for seed in (499, 500, 599):
-        write_root(tmp_path / str(seed), frames=2, seed=seed, size=(8, 8))
-    training, validation = names(DataConfig(roots=[tmp_path]))
-    assert training == ["simulated/499[0:2]"]
-    assert validation == ["simulated/500[0:2]", "simulated/599[0:2]"]
-
-
-@pytest.fixture
-def raw(tmp_path: Path, write_raw: Callable[..., Path]) -> Path:
-    """A drive to train on, one of Eigen's scenes, and the drives of the odometry sequences 00 (a scene too) and 09."""
-    for drive in (
-        "09_26_drive_0001",
-        "09_26_drive_0005",
-        "09_26_drive_0013",
-        "10_03_drive_0027",
-        "09_30_drive_0033",
-    ):
-        write_raw(tmp_path / "raw", drive=f"2011_{drive}", speeds=[9, 9, 9, 0, 9, 9], size=(16, 24))
-    return tmp_path / "raw"
-
-
-def drives(config: DataConfig) -> tuple[set[str], set[str]]:
-    training, validation = split_recordings(config)
-    return {r.name[-10:] for r in training}, {r.name[-10:] for r in validation}
-
-
-def test_eigens_scenes_and_test_sequences_are_left_out(raw: Path) -> None:
-    assert drives(DataConfig(roots=[raw])) == ({"drive_0001", "drive_0005"}, set())
-    everything = DataConfig(roots=[raw], exclude=[])
-    assert drives(everything)[0] == {
-        "drive_0001",
-        "drive_0005",
-        "drive_0013",
-        "drive_0027",
-        "drive_0033",
-    }
-    assert "drive_0033" not in drives(DataConfig(roots=[raw], exclude=["kitti_odometry/09"]))[0]
-
-
-def test_static_frames_are_left_out(raw: Path, caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level("INFO"):
-        training, _ = names(
-            DataConfig(roots=[raw], exclude=["kitti_raw/2011_09_26_drive_0005", "eigen"])
-        )
-    assert training[:2] == [
-        "kitti_raw/2011_09_26_drive_0001[0:3]",
-        "kitti_raw/2011_09_26_drive_0001[4:6]",
-    ]
-    assert "4 of 24 frames" in caplog.text
-
-
-def test_the_odometry_split(tmp_path: Path, write_root: Callable[..., Path]) -> None:
-    root = write_root(
-        tmp_path, frames=3, sequences=("00", "03", "06", "09", "10", "11"), size=(8, 8)
-    )
-    training, validation = names(
-        DataConfig(roots=[root], split="odometry", validation=[], exclude=[])
-    )
-    assert training == ["kitti_odometry/00[0:3]", "kitti_odometry/03[0:3]"]
-    assert validation == ["kitti_odometry/06[0:3]"]
-
-
 def test_exact_labels_of_a_snippet_and_its_mirror_image(tmp_path: Path) -> None:
     """True motion and depth in camera heights, of a camera of the reference focal length."""
     street = SimulatedStreet(SimulationOptions("straight", 6, 1, 96, 64))
@@ -368,46 +271,212 @@ def test_exact_labels_are_wanted_of_every_recording(
         SnippetDraws(discover(write_root(tmp_path, 6)), config, draws=4)
 
 
-def test_the_end_of_each_recording_that_is_long_enough_is_kept_to_validate_on(
-    tmp_path: Path, write_root: Callable[..., Path]
-) -> None:
-    write_root(tmp_path / "long", 50, ("01",), size=(32, 48))
-    write_root(tmp_path / "short", 20, ("04",), size=(32, 48))
-    config = DataConfig(
-        roots=[tmp_path / "long", tmp_path / "short"], validation=[], validation_share=0.4
+# single images with their true depth as the label
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("exact") / "world"
+    write_kitti_root(
+        SimulatedStreet(SimulationOptions("straight", 6, 1, 96, 64, varied=True)),
+        folder,
+        depth=True,
     )
-    training, validation = split_recordings(config)
-    assert [each.frames_name for each in training] == [
-        "kitti_odometry/01[0:30]",
-        "kitti_odometry/04[0:20]",
+    return folder
+
+
+@pytest.fixture
+def mixed(
+    world: Path, write_root: Callable[..., Path], tmp_path: Path
+) -> Callable[..., ExperimentConfig]:
+    """An experiment on the world and a real drive, half exact."""
+    real = write_root(tmp_path / "real", 12)
+
+    def build(roots: tuple[Path, ...] = (world, real), **data: Any) -> ExperimentConfig:
+        sections: dict[str, Any] = {
+            "network": {
+                "height": SIZE[0],
+                "width": SIZE[1],
+                "sources": 2,
+                "depth_width": 0.1,
+                "pose_width": 0.1,
+            },
+            "data": {
+                "workers": 0,
+                "flip": 0,
+                "zoom": 1,
+                "exact": 0.5,
+                "validation": [],
+                "roots": list(roots),
+            }
+            | data,
+            "loss": {"smoothness": "disparity-edge-aware", "smoothness_weight": 0.001},
+            "teacher": {
+                "views": "many",
+                "structure_weight": 1,
+                "edge_weight": 1,
+                "cache": tmp_path / "measured",
+            },
+            "training": {"networks": "depth", "batch": 4, "steps": 1},
+        }
+        return ExperimentConfig.model_validate(sections)
+
+    return build
+
+
+def test_the_label_is_the_inverse_depth_in_camera_heights(
+    world: Path, mixed: Callable[..., ExperimentConfig], measure: Callable[..., None]
+) -> None:
+    config = mixed()
+    measure(config, lambda *_: 0.25)
+    recordings, _ = split_recordings(config.data)
+    teacher = ManyViewTeacher(config.teacher.cache, SIZE, config.teacher.stride)  # type: ignore[arg-type]
+    sample = SnippetDraws(recordings, config, 8, many_views=teacher).draw(0)
+    recording = next(each for each in recordings if each.exact)
+    height_m = SimulatedStreet(
+        SimulationOptions("straight", 6, 1, 96, 64, varied=True)
+    ).camera_height_m
+    assert recording.camera_height_m == pytest.approx(height_m)
+    images = [recording.image(index, *SIZE) for index in range(len(recording))]
+    shown = sample["target"].permute(1, 2, 0).numpy()
+    index = next(k for k, image in enumerate(images) if np.array_equal(image, shown))
+    depth_m = recording.true_depth(index)
+    assert depth_m is not None
+    nearer = recording.camera.fy / SIZE[0] / FOCAL_LENGTH
+    wanted = torch.from_numpy(
+        height_m / np.where(depth_m > 0, depth_m, FARTHEST_M) * nearer
+    ).float()
+    torch.testing.assert_close(sample["most"][0], wanted)
+    known = torch.from_numpy(depth_m > 0)
+    torch.testing.assert_close(sample["least"][0], torch.where(known, wanted, 0))
+
+
+def test_a_batch_begins_with_its_share_of_single_images(
+    mixed: Callable[..., ExperimentConfig], measure: Callable[..., None]
+) -> None:
+    config = mixed()
+    measure(config, lambda *_: 0.25)
+    recordings, _ = split_recordings(config.data)
+    teacher = ManyViewTeacher(config.teacher.cache, SIZE, config.teacher.stride)  # type: ignore[arg-type]
+    draws = SnippetDraws(recordings, config, 8, many_views=teacher)
+    for batch in DataLoader(draws, 4, collate_fn=stacked):
+        assert len(batch["target"]) == len(batch["least"]) == len(batch["K"]) == 4
+        assert len(batch["sources"]) == len(batch["T_source_target"]) == 2
+    singles = ["sources" not in draws.draw(number) for number in range(8)]
+    assert singles == [True, True, False, False] * 2
+
+
+def test_a_prepared_folder_trains_without_the_worlds(
+    mixed: Callable[..., ExperimentConfig], measure: Callable[..., None], tmp_path: Path
+) -> None:
+    config = mixed()
+    measure(config, lambda *_: 0.25)
+    prepare(config, tmp_path / "prepared")
+    original, again = (
+        SnippetDraws(split_recordings(c.data)[0], c, 4)
+        for c in (config, mixed((tmp_path / "prepared",)))
+    )
+    for number in range(2):
+        one, other = original.draw(number), again.draw(number)
+        torch.testing.assert_close(
+            other["least"], one["least"], msg="exact depth of the same pixels"
+        )
+    train(mixed((tmp_path / "prepared",)), tmp_path / "run", device="cpu")
+    assert read_record(tmp_path / "run" / "model.yaml").trained_on == [
+        "simulated/1",
+        "kitti_odometry/00[0:12]",
     ]
-    assert [each.frames_name for each in validation] == ["kitti_odometry/01[30:50]"]
-    with pytest.raises(
-        DataError, match=r"validation_share 0\.4 leaves fewer than 20 frames of .*/04 \(20 frames\)"
-    ):
-        split_recordings(config.model_copy(update={"roots": [tmp_path / "short"]}))
 
 
-@pytest.mark.parametrize(("name", "count"), [("eigen", 61), ("odometry", 11)])
-def test_nothing_is_in_two_lists(name: str, count: int) -> None:
-    split = read_split_file(name)
-    assert split.train and split.validation
-    assert overlapping([*split.train, *split.validation], split.test_recordings) == []
-    assert overlapping(split.train, split.validation) == []
-    everything = [*split.train, *split.validation, *split.test_recordings]
-    assert len(set(everything)) == len(everything) == count
+@pytest.mark.parametrize("where", [".", "images"])
+def test_a_depth_camera_is_exact_and_what_it_does_not_see_may_be_anywhere(
+    mixed: Callable[..., ExperimentConfig],
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    where: str,
+) -> None:
+    folder = tmp_path / "office"
+    (folder / "depth").mkdir(parents=True)
+    (folder / "images").mkdir()
+    depth = np.full((64, 96), 2000, np.uint16)  # millimetres
+    depth[:32] = 0
+    for index in range(6):
+        cv2.imwrite(
+            str(folder / "images" / f"{index:06d}.png"), np.full((64, 96, 3), 30 * index, np.uint8)
+        )
+        cv2.imwrite(str(folder / "depth" / f"{index:06d}.png"), depth)
+    camera = "width: 96\nheight: 64\nfx: 90\nfy: 90\ncx: 48\ncy: 32\nfps: 5\n"
+    (folder / where / "camera.yaml").write_text(camera)
+    with pytest.raises(DataError, match="add depth_per_metre"):
+        discover(folder)
+    (folder / where / "camera.yaml").write_text(camera + "depth_per_metre: 1000\n")
+    config = mixed((folder, tmp_path / "real"), weights={"folder": 1, "kitti": 1})
+    recordings, _ = split_recordings(config.data)
+    draws = SnippetDraws(
+        recordings, config, 8, imitated=lambda image: np.ones(image.shape[:2], np.float32)
+    )
+    sample = draws.draw(0)
+    nearer = 90 / SIZE[0] / FOCAL_LENGTH
+    assert torch.isinf(sample["most"][0, :32]).all()
+    torch.testing.assert_close(
+        sample["least"][0, 32:], torch.full((32, 96), INDOOR_HEIGHT_M / 2 * nearer)
+    )
+    (folder / "depth" / "000003.png").unlink()
+    assert not discover(folder)[0].exact
+    assert "000003.png" in caplog.text
 
 
-@pytest.mark.parametrize(
-    ("runs", "frames"),
-    [
-        ("3", [3]),
-        ("0:3", [0, 1, 2]),
-        ("0:7:3", [0, 3, 6]),
-        ("0:7:3, 9,11:13", [0, 3, 6, 9, 11, 12]),
-    ],
-)
-def test_runs(runs: str, frames: list[int]) -> None:
-    assert Split(test=[f"kitti_raw/a[{runs}]"]).test_frames() == [
-        ("kitti_raw/a", frame) for frame in frames
-    ]
+def test_worlds_are_drawn_by_their_weight(
+    world: Path, mixed: Callable[..., ExperimentConfig]
+) -> None:
+    (recording,) = discover(world)
+    twice = [recording, replace(recording, name="folder/office")]
+    np.testing.assert_allclose(chances(twice, [1, 1], {"simulated": 9, "folder": 1}), [0.9, 0.1])
+    with pytest.raises(ValueError, match="less than one sample"):
+        mixed(exact=0.2)
+
+
+# depth of a network as the label of another one
+
+
+def imitation(root: Path) -> ExperimentConfig:
+    """An experiment on one drive that imitates the depth of ``sim``."""
+    tree: dict[str, dict[str, Any]] = {
+        "teacher": {"views": "network", "slam_weights": "sim", "structure_weight": 1},
+        "network": {"height": 32, "width": 48, "sources": 2, "depth_width": 0.1, "pose_width": 0.1},
+        "data": {"workers": 0, "flip": 1, "zoom": 1, "validation": [], "roots": [root]},
+        "loss": {"photometric_weight": 0, "smoothness_weight": 0},
+        "training": {"networks": "depth", "batch": 2, "steps": 1},
+    }
+    return ExperimentConfig.model_validate(tree)
+
+
+def test_the_label_is_what_the_network_gives_for_the_larger_image(
+    write_root: Callable[..., Path], tmp_path: Path
+) -> None:
+    config = imitation(write_root(tmp_path / "real", 3))
+    (recording,), _ = split_recordings(config.data)
+    seen = []
+
+    def imitated(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        seen.append(image)
+        return learned_inverse_depth("sim", image)
+
+    draws = SnippetDraws([recording], config, 1, imitated=imitated)
+    sample = draws.draw(0)
+    stored = recording.image(1, 64, 96)
+    depth = DepthPosePredictor.from_weights("sim", "cpu", "onnx").depth(stored)
+    disparity = 1 / depth[:, ::-1]  # every image is mirrored
+    torch.testing.assert_close(sample["least"], sample["most"])
+    wanted = torch.from_numpy(disparity.reshape(32, 2, 48, 2).mean((1, 3)))[None] / HEIGHTS
+    torch.testing.assert_close(sample["most"], wanted, rtol=2e-3, atol=1e-4)
+    torch.testing.assert_close(draws.draw(0)["most"], sample["most"], rtol=0, atol=0)
+    assert len(seen) == 1, "the label is kept"
+
+
+def test_it_trains_depth_alone(write_root: Callable[..., Path], tmp_path: Path) -> None:
+    output = train(imitation(write_root(tmp_path / "real", 5)), tmp_path / "run", device="cpu")
+    assert (output / "last" / "depth.safetensors").is_file()
+    assert not (output / "last" / "pose.safetensors").exists()
+    record = read_record(output / "last" / "model.yaml")
+    assert set(read_record(find_weights("sim") / "model.yaml").trained_on) <= set(record.trained_on)

@@ -12,7 +12,8 @@ import pytest
 from erfsfm.config import DataConfig
 from erfsfm.data.discovery import open_drive
 from erfsfm.data.recordings import Recording
-from erfsfm.data.split import moving_parts, split_recordings
+from erfsfm.data.split import split_recordings
+from erfsfm.data.standstill import moving_parts
 
 WriteDrive = Callable[..., Path]
 

@@ -7,7 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from erfsfm.evaluation.depth_metrics import depth_errors, mean_errors, valid_pixels
+from erfsfm.evaluation.depth_metrics import (
+    depth_errors,
+    mean_errors,
+    mean_ratio,
+    standard_error,
+    valid_pixels,
+)
 
 
 def test_perfect_up_to_scale() -> None:
@@ -59,3 +65,13 @@ def test_every_image_counts_once() -> None:
     assert mean_errors([first, second]).abs_rel == pytest.approx(0.25)
     with pytest.raises(ValueError, match="no image"):
         mean_errors([])
+
+
+def test_standard_error_and_ratio_are_those_over_streets() -> None:
+    assert standard_error([1.0, 3.0]) == pytest.approx(1.0), (
+        "a standard deviation of sqrt(2) of two streets"
+    )
+    assert standard_error([1.0]) is None
+    ratio, error = mean_ratio([0.1, 0.4], to=[0.2, 0.2])
+    assert ratio == pytest.approx(1.0) and error == pytest.approx(np.log(2))
+    assert mean_ratio([0.1], to=[0.2]) == (pytest.approx(0.5), None)

@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 import runpy
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from small_drives import write_drive, write_root
 
 from erfsfm.common.errors import ConfigError
 
-TOOLS = Path(__file__).parents[3] / "tools"
+TOOLS = Path(__file__).parents[2] / "tools"
 SMALL = [
     "network.depth_width=0.0625",
     "network.pose_width=0.125",
@@ -53,8 +53,6 @@ def test_rows_are_those_of_the_paper(tool: dict[str, Any]) -> None:
 def test_tables_of_a_small_fake(
     tool: dict[str, Any],
     tmp_path: Path,
-    write_root: Callable[..., Path],
-    write_drive: Callable[..., Path],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -94,10 +92,7 @@ def test_tables_of_a_small_fake(
 
 
 def test_what_is_tested_is_required_first(
-    tool: dict[str, Any],
-    tmp_path: Path,
-    write_root: Callable[..., Path],
-    monkeypatch: pytest.MonkeyPatch,
+    tool: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kitti = write_root(tmp_path / "kitti", frames=12, sequences=("00", "06", "09"))
     monkeypatch.setattr(sys, "argv", ["reproduce.py"])

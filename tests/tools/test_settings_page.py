@@ -1,4 +1,4 @@
-"""Every tool has a help text with an example, and docs/settings.md is the page that its tool writes."""
+"""docs/settings.md is the page that its tool writes."""
 
 import runpy
 import sys
@@ -7,18 +7,6 @@ from pathlib import Path
 import pytest
 
 TOOLS = Path(__file__).parents[2] / "tools"
-
-
-@pytest.mark.parametrize("tool", sorted(TOOLS.glob("*.py")), ids=lambda p: p.name)
-def test_help_shows_an_example(
-    tool: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.syspath_prepend(str(TOOLS))
-    monkeypatch.setattr(sys, "argv", [str(tool), "--help"])
-    with pytest.raises(SystemExit) as ended:
-        runpy.run_path(str(tool), run_name="__main__")
-    assert not ended.value.code
-    assert "Example:" in capsys.readouterr().out
 
 
 def test_the_page_of_settings_is_current(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

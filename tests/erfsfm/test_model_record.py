@@ -11,7 +11,7 @@ import pytest
 from erfsfm.common.errors import DataError
 from erfsfm.config import ExperimentConfig
 from erfsfm.evaluation.eigen import eigen_protocol
-from erfsfm.evaluation.protocols import pose_protocol
+from erfsfm.evaluation.pose_protocols import pose_protocol
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.model_record import read_record
 from erfsfm.training.run import train

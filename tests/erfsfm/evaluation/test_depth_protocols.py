@@ -1,8 +1,8 @@
-"""The evaluation protocols with oracle networks."""
+"""The protocols of depth with oracle networks."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -11,140 +11,18 @@ import pytest
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.camera_file import Pinhole
-from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.config import ExperimentConfig
-from erfsfm.data.discovery import discover
+from erfsfm.data.discovery import discover, named_recordings
 from erfsfm.data.many_view_teacher import ManyViewTeacher
-from erfsfm.evaluation.depth_metrics import mean_ratio, standard_error
-from erfsfm.evaluation.protocols import (
-    EVERY,
-    TRUTH_FOLDER,
-    depth_protocol,
-    many_view_protocol,
-    named_recordings,
-    pose_protocol,
-)
+from erfsfm.evaluation.depth_protocols import TRUTH_FOLDER, depth_protocol, many_view_protocol
+from erfsfm.evaluation.streets import EVERY
 from erfsfm.training.run import prepare
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 
-
-class Oracle:
-    """Right up to scale about the drive of ``write_root``, which it recognises by nothing but the calls."""
-
-    measures = False
-
-    def __init__(
-        self, step: tuple[float, float, float], sources: int = 4, seen: Sequence[str] = ()
-    ) -> None:
-        self.step = np.array(step)
-        self.sources = sources
-        self.seen = seen
-
-    @staticmethod
-    def prepare(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        return image
-
-    def depth(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        return np.full(image.shape[:2], 3.0, np.float32)
-
-    def measured_poses(
-        self, guess: NDArray[np.float64], images: Sequence[NDArray[np.uint8]], camera: Pinhole
-    ):
-        assert (camera.height, camera.width) == images[0].shape[:2]
-        return guess
-
-    def guessed_poses(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64]:
-        assert len(images) == self.sources + 1
-        T_source_target = np.tile(np.eye(4), (self.sources, 1, 1))
-        offsets = [k for k in range(-self.sources // 2, self.sources // 2 + 1) if k]
-        T_source_target[:, :3, 3] = [-k * self.step / 3 for k in offsets]  # another scale
-        return T_source_target
-
-    def leaks(self, names: Sequence[str]) -> list[str]:
-        return overlapping(names, self.seen)
-
-
 STEP = (0.05, 0.0, 0.1)
-
-
-def test_depth(tmp_path: Path, write_root: Callable[..., Path]) -> None:
-    write_root(tmp_path, frames=11, depth=True, seed=600, step=STEP)
-    networks, median = depth_protocol({"networks": Oracle(STEP)}, [tmp_path], allow_leak=False)
-    assert networks["images"] == 3, "every fifth frame"
-    assert networks["abs_rel"] == pytest.approx(0, abs=1e-3)
-    assert networks["scale"] == pytest.approx(np.mean([6.0, 5.5, 5.0]) / 3, abs=1e-3)
-    assert networks["scale_spread"] == pytest.approx(np.std([6.0, 5.5, 5.0]) / 5.5, abs=1e-3)
-    assert median["method"] == "median depth map"
-
-
-def test_depth_of_a_pack(
-    tmp_path: Path, write_root: Callable[..., Path], small: dict[str, dict[str, object]]
-) -> None:
-    """It holds smaller images than depth maps, and depth of the middle of each snippet alone."""
-    roots = [write_root(tmp_path / "seen", frames=3, seed=1)]
-    roots += [write_root(tmp_path / "held_out", frames=11, depth=True, seed=500, step=STEP)]
-    data = {"roots": roots, "validation": ["simulated/500"]}
-    prepare(ExperimentConfig.model_validate(small | {"data": data}), tmp_path / "prepared")
-    networks, _ = depth_protocol(
-        {"networks": Oracle(STEP)}, [tmp_path / "prepared"], allow_leak=False
-    )
-    assert networks["images"] == 9
-    assert networks["abs_rel"] == pytest.approx(0, abs=1e-3)
-
-
-@pytest.mark.parametrize("name", ["00", "kitti_odometry/00"])
-def test_pose(tmp_path: Path, write_root: Callable[..., Path], name: str) -> None:
-    write_root(tmp_path, frames=9, step=STEP, cameras=("image_2", "image_3"))
-    networks, straight = pose_protocol(Oracle(STEP), tmp_path, [name], "default", allow_leak=False)
-    assert networks["snippets"] == 5
-    assert networks["ate_mean"] == pytest.approx(0, abs=1e-9)
-    assert straight["ate_mean"] > 0.01, "the drive slides sideways"
-    assert networks["leak"] is False
-
-
-def test_the_pose_network_alone_stands_beside_what_is_measured(
-    tmp_path: Path, write_root: Callable[..., Path]
-) -> None:
-    write_root(tmp_path, frames=9, step=STEP)
-
-    class Measuring(Oracle):
-        measures = True
-        guessed_poses = staticmethod(lambda images: np.tile(np.eye(4), (4, 1, 1)))
-
-        def measured_poses(self, guess, images, camera):
-            return Oracle.guessed_poses(self, images)
-
-    rows = pose_protocol(Measuring(STEP), tmp_path, ["00"], "default", allow_leak=False)
-    assert [row["method"] for row in rows] == [
-        "networks",
-        "pose network alone",
-        "straight constant motion",
-    ]
-    assert rows[0]["ate_mean"] == pytest.approx(0, abs=1e-9) and rows[1]["ate_mean"] > 0.01
-
-
-def test_frames_of_a_sequence_are_checked_for_leaks(
-    tmp_path: Path, write_root: Callable[..., Path]
-) -> None:
-    write_root(tmp_path, frames=20, step=STEP)
-    seen = Oracle(STEP, seen=["kitti_odometry/00[0:12]"])
-    networks, _ = pose_protocol(seen, tmp_path, ["00[12:]"], "default", allow_leak=False)
-    assert networks["snippets"] == 4 and networks["leak"] is False
-    assert networks["recording"] == "kitti_odometry/00[12:20]"
-    with pytest.raises(DataError):
-        pose_protocol(seen, tmp_path, ["00[11:]"], "default", allow_leak=False)
-
-
-def test_paper_fidelity_counts_four_empty_snippets(
-    tmp_path: Path, write_root: Callable[..., Path]
-) -> None:
-    write_root(tmp_path, frames=9, step=STEP)
-    default = pose_protocol(Oracle(STEP), tmp_path, ["00"], "default", allow_leak=False)[1]
-    paper = pose_protocol(Oracle(STEP), tmp_path, ["00"], "paper", allow_leak=False)[1]
-    assert paper["ate_mean"] == pytest.approx(default["ate_mean"] * 5 / 9)
+HEIGHT_M = 1.65
 
 
 class Flat:
@@ -166,6 +44,29 @@ class Slanted(Flat):
         return super().depth(image) * np.linspace(1, 2, image.shape[1], dtype=np.float32)
 
 
+def test_depth(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path, frames=11, depth=True, seed=600, step=STEP)
+    networks, median = depth_protocol({"networks": Flat()}, [tmp_path], allow_leak=False)
+    assert networks["images"] == 3, "every fifth frame"
+    assert networks["abs_rel"] == pytest.approx(0, abs=1e-3)
+    assert networks["scale"] == pytest.approx(np.mean([6.0, 5.5, 5.0]) / 3, abs=1e-3)
+    assert networks["scale_spread"] == pytest.approx(np.std([6.0, 5.5, 5.0]) / 5.5, abs=1e-3)
+    assert median["method"] == "median depth map"
+
+
+def test_depth_of_a_pack(
+    tmp_path: Path, write_root: Callable[..., Path], small: dict[str, dict[str, object]]
+) -> None:
+    """It holds smaller images than depth maps, and depth of the middle of each snippet alone."""
+    roots = [write_root(tmp_path / "seen", frames=3, seed=1)]
+    roots += [write_root(tmp_path / "held_out", frames=11, depth=True, seed=500, step=STEP)]
+    data = {"roots": roots, "validation": ["simulated/500"]}
+    prepare(ExperimentConfig.model_validate(small | {"data": data}), tmp_path / "prepared")
+    networks, _ = depth_protocol({"networks": Flat()}, [tmp_path / "prepared"], allow_leak=False)
+    assert networks["images"] == 9
+    assert networks["abs_rel"] == pytest.approx(0, abs=1e-3)
+
+
 def write_pairs(root: Path, street: str, farther: list[bool]) -> None:
     """Images with four known depths: 10 m, and one of 20 m where ``farther``, which makes an AbsRel of 0.125."""
     for folder in ("images", "truth"):
@@ -179,16 +80,6 @@ def write_pairs(root: Path, street: str, farther: list[bool]) -> None:
         truth[50, 50] *= 1 + with_far
         truth[2, 2] = 60 * 256  # outside the crop
         cv2.imwrite(str(root / "truth" / f"{street}_{index:06d}.png"), truth)
-
-
-def test_standard_error_and_ratio_are_those_over_streets() -> None:
-    assert standard_error([1.0, 3.0]) == pytest.approx(1.0), (
-        "a standard deviation of sqrt(2) of two streets"
-    )
-    assert standard_error([1.0]) is None
-    ratio, error = mean_ratio([0.1, 0.4], to=[0.2, 0.2])
-    assert ratio == pytest.approx(1.0) and error == pytest.approx(np.log(2))
-    assert mean_ratio([0.1], to=[0.2]) == (pytest.approx(0.5), None)
 
 
 def test_streets_count_alike_and_have_standard_errors(tmp_path: Path) -> None:
@@ -263,9 +154,6 @@ def test_a_leak_of_one_street_is_refused(tmp_path: Path, write_root: Callable[..
         depth_protocol({"networks": Flat()}, roots, allow_leak=False)  # type: ignore[arg-type]
     rows = depth_protocol({"networks": Flat()}, roots, allow_leak=True)  # type: ignore[arg-type]
     assert [row["leak"] for row in rows] == [True, False, True]
-
-
-HEIGHT_M = 1.65
 
 
 class Networks:

@@ -1,0 +1,236 @@
+"""Protocols of depth: trained networks on streets with true depth, or on drives that have none.
+
+On streets a baseline that uses no image stands beside the networks. On drives without truth static
+surfaces are measured from neighbouring frames at a run's poses.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from erfsfm.common.errors import DataError
+from erfsfm.common.files import write_atomically
+from erfsfm.common.progress import Progress, silent
+from erfsfm.data.many_view_teacher import LARGEST_WIDTH, ManyViewTeacher
+from erfsfm.data.recordings import Recording
+from erfsfm.evaluation.depth_metrics import (
+    CAP_M,
+    DepthErrors,
+    depth_errors,
+    mean_errors,
+    mean_ratio,
+    standard_error,
+)
+from erfsfm.evaluation.streets import EVERY, Street, find_streets
+from erfsfm.inference import DepthPosePredictor, refuse_leak
+
+_BASELINE = "median depth map"
+_PICTURE_WIDTH = 620
+
+CAP_HEIGHTS = 50.0  # camera heights: some 80 m from a car's roof
+LARGEST_RATIO = 1.3  # of the bounds of a pixel's depth; wider ones are no truth
+SLAM_WEIGHTS = "default"
+TRUTH_FOLDER = "truth"
+_RATIOS = ("abs_rel", "rmse_log", "a1", "a2", "a3")  # errors without a unit: the scale is fitted
+
+
+def depth_protocol(
+    networks: Mapping[str, DepthPosePredictor],
+    roots: Sequence[Path],
+    allow_leak: bool,
+    progress: Progress = silent,
+    pictures: Path | None = None,
+) -> list[dict[str, Any]]:
+    """Median-scaled depth errors under 80 m on the streets of all roots, each of which counts alike.
+
+    Args:
+        networks: to evaluate, by the name of their rows.
+        roots: with true depth.
+        allow_leak: evaluate also streets that networks were trained on.
+        progress: told of the stage, what is done, and of how many.
+        pictures: a folder that receives a picture of a frame of each street: image, median-scaled depths, and truth.
+
+    Returns:
+        A row for each networks, and, where depth is dense, one for the median depth map of a root, a baseline that
+        uses no image. Of several streets these are means, ``abs_rel_se`` is the standard error over streets, and rows
+        for each street follow. ``ratio`` is ``abs_rel`` over that of the first networks on the same street, of
+        several streets the geometric mean, with its standard error over streets ``ratio_se``.
+
+    Raises:
+        DataError: no true depth under a root, or a leak that was not allowed.
+    """
+    streets: list[Street] = []
+    for root in roots:
+        streets += find_streets(root)
+    leaks: dict[str, list[bool]] = {}
+    for name, each in networks.items():
+        leaks[name] = [refuse_leak(each, street.seen, allow_leak) for street in streets]
+    total = sum(len(street.frames) for street in streets)
+    done = 0
+    errors: dict[str, list[list[DepthErrors]]] = {}
+    for name in (*networks, _BASELINE):
+        errors[name] = [[] for _ in streets]
+    for place, street in enumerate(streets):
+        to_draw = pictures
+        for load in street.frames:
+            progress("depth", done, total)
+            image, truth = load()
+            guesses = {name: each.depth(image) for name, each in networks.items()}
+            if street.typical is not None:
+                guesses[_BASELINE] = street.typical
+            compared: dict[str, DepthErrors] = {}
+            for name, guess in guesses.items():
+                error = depth_errors(guess, truth, CAP_M, street.crop)
+                if error is not None:
+                    compared[name] = error
+                    errors[name][place].append(error)
+            if to_draw is not None and compared:
+                scaled = [guesses[name] * np.float32(compared[name].scale) for name in networks]
+                jpeg, file = _picture(image, scaled, truth), f"{street.name.replace('/', '-')}.jpg"
+                write_atomically(to_draw / file, jpeg)
+                to_draw = None
+            done += 1
+        if not all(errors[name][place] for name in networks):
+            raise DataError(
+                f"no depth between 0 and {CAP_M:g} m in {street.name}: nothing to compare with"
+            )
+    return _depth_rows(networks, streets, errors, leaks)
+
+
+def _depth_rows(
+    networks: Mapping[str, DepthPosePredictor],
+    streets: Sequence[Street],
+    errors: Mapping[str, list[list[DepthErrors]]],
+    leaks: Mapping[str, list[bool]],
+) -> list[dict[str, Any]]:
+    """Means of each method over streets, and, where there are several, a row for each street."""
+    first = next(iter(networks))
+    rows = []
+    for name, compared in errors.items():
+        if all(compared):
+            before = None if name in (first, _BASELINE) else errors[first]
+            rows.append(_depth_row(name, compared, before) | {"leak": any(leaks.get(name, ()))})
+    for place, street in enumerate(streets if len(streets) > 1 else ()):
+        for name in networks:
+            row = _depth_row(
+                name, [errors[name][place]], None if name == first else [errors[first][place]]
+            )
+            rows.append(row | {"leak": leaks[name][place], "street": street.name})
+    return rows
+
+
+def _picture(
+    image: NDArray[np.uint8], depths: Iterable[NDArray[np.float32]], truth: NDArray[np.float32]
+) -> bytes:
+    """A JPEG, image, depths in metres and truth below each other, at most `_PICTURE_WIDTH` wide; near is bright."""
+    known = truth > 0
+    nearness = [1 / depth for depth in depths]
+    nearness.append(np.where(known, 1 / np.where(known, truth, 1), 0))
+    ratio = min(1, _PICTURE_WIDTH / image.shape[1])
+    height = round(image.shape[0] * ratio)
+    width = round(image.shape[1] * ratio)
+    points = 1 + 2 * round(
+        image.shape[1] / _PICTURE_WIDTH
+    )  # of LiDAR, which would vanish in a smaller picture
+    nearness[-1] = cv2.dilate(nearness[-1], np.ones((points, points)))
+    brightest = np.percentile(nearness[-1][nearness[-1] > 0], 98)
+    shown = [image[..., ::-1]]
+    for values in nearness:
+        shade = np.clip(values / brightest * 255, 0, 255).astype(np.uint8)
+        shown.append(np.asarray(cv2.applyColorMap(shade, cv2.COLORMAP_MAGMA), np.uint8))
+    rows = [cv2.resize(each, (width, height), interpolation=cv2.INTER_AREA) for each in shown]
+    return bytes(cv2.imencode(".jpg", np.vstack(rows))[1])
+
+
+def _depth_row(
+    method: str, streets: list[list[DepthErrors]], before: list[list[DepthErrors]] | None
+) -> dict[str, Any]:
+    """Means over streets of the means over their frames, and their ratio to those of other networks ``before``."""
+    means = [mean_errors(errors) for errors in streets]
+    abs_rel = [each.abs_rel for each in means]
+    row: dict[str, Any] = {
+        "method": method,
+        **asdict(mean_errors(means)),
+        "abs_rel_se": standard_error(abs_rel),
+    }
+    if before is not None:
+        row["ratio"], row["ratio_se"] = mean_ratio(
+            abs_rel, [mean_errors(errors).abs_rel for errors in before]
+        )
+    for key in ("abs_rel_se", "ratio_se"):
+        if key in row and row[key] is None:
+            row[f"{key}_reason"] = "one street"
+    scales = np.array([each.scale for each in chain.from_iterable(streets)])
+    row["scale_spread"] = float(scales.std() / scales.mean())
+    return row | {"images": len(scales), "streets": len(streets)}
+
+
+def many_view_protocol(
+    networks: DepthPosePredictor,
+    recordings: Sequence[Recording],
+    cache: Path | None,
+    allow_leak: bool,
+    progress: Progress,
+) -> list[dict[str, Any]]:
+    """Median-scaled depth errors where the many-view teacher knows the depth within ``LARGEST_RATIO``.
+
+    What moves, shines or is seen by one neighbour alone is left out, so the errors are smaller than against LiDAR:
+    compare rows of this protocol with each other.
+
+    Args:
+        networks: to evaluate.
+        recordings: whole drives, or parts of them.
+        cache: receives poses and depth, for the next call; forgotten where None.
+        allow_leak: evaluate also frames that the networks were trained on.
+        progress: told of the stage, what is done, and of how many.
+
+    Returns:
+        One row for each recording; ``known`` is the share of pixels that were compared.
+
+    Raises:
+        DataError: a leak that was not allowed, or no depth could be measured.
+        TrainingError: a recording gives no trajectory or no scale.
+    """
+    leaks = [refuse_leak(networks, [each.frames_name], allow_leak) for each in recordings]
+    rows = []
+    with tempfile.TemporaryDirectory(prefix="erfsfm-truth-") as temporary:
+        for recording, leak in zip(recordings, leaks):
+            ratio = min(1.0, LARGEST_WIDTH / recording.camera.width)
+            size = (round(recording.camera.height * ratio), round(recording.camera.width * ratio))
+            # the teacher's labels are measured around a network's depth, and truth without any
+            teacher = ManyViewTeacher((cache or Path(temporary)) / TRUTH_FOLDER, size, EVERY)
+            teacher.prepare([recording], networks.sources, SLAM_WEIGHTS, progress)
+            drive, errors, known = teacher.drive(recording), [], []
+            for target in drive.targets(networks.sources):
+                low, high = (bound.astype(np.float32) for bound in drive.label(target))
+                narrow = (low > 0) & (high < LARGEST_RATIO * low)
+                truth = np.zeros_like(low)  # where the bounds are too far apart
+                truth[narrow] = 1 / np.sqrt(low[narrow] * high[narrow])
+                error = depth_errors(
+                    networks.depth(recording.image(target, *truth.shape)), truth, CAP_HEIGHTS
+                )
+                if error is not None:
+                    errors.append(error)
+                    known.append(float(np.mean((truth > 0) & (truth < CAP_HEIGHTS))))
+            if not errors:
+                raise DataError(
+                    f"no depth could be measured in {recording.frames_name}: the camera has to travel"
+                )
+            mean, scales = mean_errors(errors), np.array([each.scale for each in errors])
+            row: dict[str, Any] = {"method": "networks", "recording": recording.frames_name}
+            row |= {key: getattr(mean, key) for key in _RATIOS}
+            row |= {
+                "scale_spread": float(scales.std() / scales.mean()),
+                "known": float(np.mean(known)),
+            }
+            rows.append(row | {"images": len(errors), "leak": leak})
+    return rows

@@ -39,7 +39,11 @@ class VideoFrames:
     """
 
     def __init__(self, path: Path, counted_frames: int = _COUNTED_FRAMES) -> None:
-        """Open a video; one that announces more than ``counted_frames`` is long."""
+        """Open a video; one that announces more than ``counted_frames`` is long.
+
+        Raises:
+            DataError: the video cannot be opened, or has no frame.
+        """
         self._path = path
         self._next = 0
         self._times_ms: list[float] = []

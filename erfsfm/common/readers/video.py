@@ -151,7 +151,6 @@ def _packet_times(path: Path) -> NDArray[np.float64] | None:
 
 def list_videos(folder: Path) -> list[Path]:
     """The video files directly in a folder, without hidden ones."""
-
     found = []
     for path in folder.iterdir():
         is_video = path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()

@@ -300,7 +300,16 @@ class DepthPosePredictor:
 
 
 def refuse_leak(networks: DepthPosePredictor, names: Sequence[str], allow_leak: bool) -> bool:
-    """Whether some of the frames were trained on; ``DataError`` where that was not allowed."""
+    """Whether some of the frames were trained on.
+
+    Args:
+        networks: whose record is asked.
+        names: of recordings or of their frames, as the leak record writes them.
+        allow_leak: only tell.
+
+    Raises:
+        DataError: some were, and that is not allowed.
+    """
     leaked = networks.leaks(names)
     if leaked and not allow_leak:
         some = ", ".join(leaked[:5]) + (f" and {len(leaked) - 5} more" if len(leaked) > 5 else "")

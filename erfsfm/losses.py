@@ -187,7 +187,9 @@ def step_disagreement(disparity: Tensor, bounds: Bounds) -> Tensor:
             length = max(error.shape[axis] - apart, 0)
             start = error.shape[axis] - length
             both = narrow.narrow(axis, 0, length) & narrow.narrow(axis, start, length)
-            step = error.narrow(axis, start, length) - error.narrow(axis, 0, length)
+            # the first part comes first: gradients are summed in the order in which parts are made
+            first = error.narrow(axis, 0, length)
+            step = error.narrow(axis, start, length) - first
             total = total + (step.abs() * both).sum() / both.sum().clamp(min=1)
     return total / (2 * len(STEPS_PX))
 

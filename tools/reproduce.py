@@ -57,7 +57,11 @@ class Row:
 
 
 def paper_rows(patterns: Sequence[str]) -> list[Row]:
-    """The rows of the guide whose trainings match any of the patterns."""
+    """The rows of the guide whose trainings match any of the patterns.
+
+    Raises:
+        ConfigError: no training matches.
+    """
     rows = []
     for name, cells in _ROW.findall(GUIDE.read_text(encoding="utf-8")):
         first, *rest = cells.split(" | ")

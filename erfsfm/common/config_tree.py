@@ -34,6 +34,16 @@ def load_config(
 
     Overrides are ``section.key=value``, the value in YAML; of two folders and of two overrides the first and the last
     one counts. What is wrong is one line that names the key, where it is from, what came and what is allowed.
+
+    Args:
+        model: the settings, with their defaults and bounds.
+        file_or_name: a YAML file, or the name of a shipped one.
+        overrides: ``section.key=value`` each.
+        shipped: folders of YAML files that are known by name.
+
+    Raises:
+        ConfigError: no such file or name, no YAML of sections, an unknown key, or a value out of
+            bounds.
     """
     tree: dict[str, Any] = {}
     origin = "the defaults"
@@ -53,7 +63,11 @@ def load_config(
 
 
 def find_config(file_or_name: str | Path, shipped: Sequence[Path]) -> Path:
-    """The YAML file of a path or of a shipped name."""
+    """The YAML file of a path or of a shipped name.
+
+    Raises:
+        ConfigError: it is a folder, or neither a file nor a shipped name.
+    """
     path = Path(file_or_name)
     if path.is_file():
         return path
@@ -76,7 +90,17 @@ def find_config(file_or_name: str | Path, shipped: Sequence[Path]) -> Path:
 
 
 def read_model(model: type[M], path: Path, error: type[ErfsfmError], wrong: str) -> M:
-    """A small YAML file that has no overrides; an ``error`` of one line says what is ``wrong`` with it."""
+    """A small YAML file that has no overrides; an ``error`` of one line says what is ``wrong`` with it.
+
+    Args:
+        model: what the file holds.
+        path: of the file.
+        error: class of the error.
+        wrong: what follows the path in its message.
+
+    Raises:
+        error: the file cannot be read, is not YAML, or does not fit the model.
+    """
     try:
         return model.model_validate(read_yaml(path) or {})
     except YamlError as problem:
@@ -194,7 +218,11 @@ class YamlError(ConfigError):
 
 
 def read_yaml(path: Path) -> Any:
-    """The content of a YAML file; None where it is empty."""
+    """The content of a YAML file; None where it is empty.
+
+    Raises:
+        YamlError: there is no such file, or it cannot be read, or it is not YAML.
+    """
     if not path.is_file():
         raise YamlError(f"{path} is not there, or not a file")
     try:
@@ -208,7 +236,11 @@ def read_yaml(path: Path) -> Any:
 
 
 def parse_yaml(text: str) -> Any:
-    """The value of a YAML text."""
+    """The value of a YAML text.
+
+    Raises:
+        YamlError: the text is not YAML, or a mapping has a key twice.
+    """
     try:
         return yaml.load(text, Loader=_Loader)
     except yaml.YAMLError as error:

@@ -63,7 +63,11 @@ def write_atomically(
 
 
 def refuse_foreign(files: Iterable[Path], mark: str, error: type[OneLineError]) -> None:
-    """Refuse to replace files none of which has ``mark`` in it, by which a program knows its own."""
+    """Refuse to replace files none of which has ``mark`` in it, by which a program knows its own.
+
+    Raises:
+        error: there are such files, and none has the mark.
+    """
 
     def is_foreign(path: Path) -> bool:
         try:
@@ -77,7 +81,11 @@ def refuse_foreign(files: Iterable[Path], mark: str, error: type[OneLineError]) 
 
 
 def read_bytes(path: Path, most: int) -> bytes:
-    """The content of a file, or pipe, that has no more than ``most`` bytes; else an ``OSError``."""
+    """The content of a file, or pipe, that has no more than ``most`` bytes; else an ``OSError``.
+
+    Raises:
+        OSError: it cannot be read, or is larger.
+    """
     if path.stat().st_size <= most and len(content := path.read_bytes()) <= most:
         return content
     raise OSError(errno.EFBIG, f"larger than {most / 2**20:g} MiB", str(path))
@@ -95,7 +103,11 @@ def unfinished_name(path: Path) -> str | None:
 
 
 def require_figure(path: Path) -> None:
-    """Check that a figure may be written there, before it is drawn."""
+    """Check that a figure may be written there, before it is drawn.
+
+    Raises:
+        ConfigError: a format that figures do not have, or a file that is no figure of ours.
+    """
     if path.suffix.lower() not in FIGURE_SUFFIXES:
         raise ConfigError(f"figures are written as {', '.join(FIGURE_SUFFIXES)}; got '{path.name}'")
     refuse_foreign([path], _FIGURE_MARK, ConfigError)
@@ -118,6 +130,9 @@ class FolderLock(ExitStack):
         """Hold a folder, which is made; without effect where the file system has no locks, or no folder can be made.
 
         Where another process holds it, this one ``waits`` for its end, or is refused.
+
+        Raises:
+            BusyError: another process holds the folder, and this one does not wait.
         """
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)

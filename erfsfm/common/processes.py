@@ -38,7 +38,11 @@ _FATAL = 4  # level of ONNX Runtime's own log; its errors are raised as well
 
 @contextmanager
 def processes(work: str) -> Iterator[ProcessPoolExecutor]:
-    """As many processes as there are cores, each of one thread; after an error, what they have not begun is left."""
+    """As many processes as there are cores, each of one thread; after an error, what they have not begun is left.
+
+    Raises:
+        TrainingError: one of the processes was killed.
+    """
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(os.cpu_count(), context, stay_single_threaded) as pool:
         try:

@@ -78,6 +78,10 @@ def named_recordings(root: Path, name: str) -> list[Recording]:
     """Recordings of a sequence, or their part that a name with frames means (``00[250:300]``); of its first camera.
 
     Without a name they are all recordings of the root.
+
+    Raises:
+        DataError: no data there, no such sequence, or none of its frames.
+        ConfigError: a name that is not written like that of frames.
     """
     if not name:
         return discover(root)

@@ -48,7 +48,11 @@ def encode(least: NDArray[np.floating], most: NDArray[np.floating]) -> bytes:
 
 
 def decode(data: bytes) -> tuple[Bound, Bound]:
-    """Least and most inverse depth ``(H, W)``; ``ValueError`` where these bytes are no label."""
+    """Least and most inverse depth ``(H, W)`` of the bytes of a file.
+
+    Raises:
+        ValueError: they are no picture.
+    """
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
     if picture is None:
         raise ValueError("it is no picture")

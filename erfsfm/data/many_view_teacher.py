@@ -99,7 +99,11 @@ class DriveLabels:
         return self.folder / f"{self.size[1]}x{self.size[0]}" / name
 
     def label(self, target: int) -> tuple[NDArray[np.float16], NDArray[np.float16]]:
-        """Least and most inverse depth ``(H, W)`` of a frame; ``TrainingError`` where the file is damaged."""
+        """Least and most inverse depth ``(H, W)`` of a frame.
+
+        Raises:
+            TrainingError: its file is missing or damaged.
+        """
         path = self.label_file(target)
         try:
             if self.compact:
@@ -112,7 +116,14 @@ class DriveLabels:
             ) from error
 
     def measure_poses(self, weights: str) -> None:
-        """Run the SLAM system on the drive and keep its poses; ``TrainingError`` without a trajectory or a scale."""
+        """Run the SLAM system on the drive and keep its poses.
+
+        Args:
+            weights: of the networks that the SLAM system uses.
+
+        Raises:
+            TrainingError: no trajectory, or one whose scale is not that of the camera's height.
+        """
         recording, name = self.recording, self.recording.frames_name
         with tempfile.TemporaryDirectory(prefix="erfsfm-teacher-") as temporary:
             drive, output = Path(temporary) / "drive", Path(temporary) / "run"
@@ -160,7 +171,11 @@ class DriveLabels:
         self.keep_poses(T_world_camera)
 
     def require_weights(self, weights: str) -> None:
-        """Refuse poses by other weights."""
+        """Refuse poses by other weights.
+
+        Raises:
+            TrainingError: the poses that are kept are by others.
+        """
         both = self.poses_file.is_file() and self.weights_file.is_file()
         known = self.weights_file.read_text() if both else weights
         if known != weights:
@@ -317,9 +332,19 @@ class ManyViewTeacher:
     ) -> None:
         """Compute what is not there yet, in as many processes as there are cores; a few labels in this one.
 
-        Of several programs with one folder (the processes of a training on several devices) one computes and the
-        others wait for it. ``TrainingError``: a drive has no trajectory or no scale, poses by other weights, or too few
-        labels in a prepared folder.
+        Of several programs with one folder (the processes of a training on several devices) one
+        computes and the others wait for it.
+
+        Args:
+            recordings: drives, or parts of prepared ones.
+            sources: of a snippet, besides its target.
+            weights: of the networks that the SLAM system uses for the poses.
+            progress: told of the stage, what is done, and of how many.
+
+        Raises:
+            TrainingError: a drive has no trajectory or no scale, poses by other weights, or too few
+                labels
+                in a prepared folder.
         """
         with FolderLock() as lock:
             lock.take(self._folder, waits=True)

@@ -157,6 +157,9 @@ class Recording:
         """``T_world_camera`` ``(N, 4, 4)``, or None where the recording has no poses.
 
         In ``paper`` fidelity those of camera 0, as the reference compares with.
+
+        Raises:
+            DataError: the file holds no poses, or ends before the recording.
         """
         if self.poses_file is None:
             return None

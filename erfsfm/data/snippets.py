@@ -293,7 +293,12 @@ class ExactLabels:
 def by_label(
     recordings: Sequence[Recording], config: ExperimentConfig
 ) -> tuple[list[Recording], list[Recording]]:
-    """The recordings of which single images with exact depth are drawn, and those of which snippets are."""
+    """The recordings of which single images with exact depth are drawn, and those of which snippets are.
+
+    Raises:
+        DataError: exact depth is wanted, and recordings lack it, or all have it and a mixture is
+            wanted.
+    """
     exact: list[Recording] = []
     measured: list[Recording] = []
     for recording in recordings:

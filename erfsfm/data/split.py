@@ -57,7 +57,11 @@ class Split(Section):
         return recordings
 
     def test_frames(self) -> list[tuple[str, int]]:
-        """Every single frame to test on: its recording and number."""
+        """Every single frame to test on: its recording and number.
+
+        Raises:
+            DataError: a name without single frames.
+        """
         frames: list[tuple[str, int]] = []
         for name in self.test:
             match = _FRAMES.fullmatch(name.strip())
@@ -77,7 +81,11 @@ class Split(Section):
 
 
 def read_split_file(name_or_path: str) -> Split:
-    """Read a shipped split by its name, or a file."""
+    """Read a shipped split by its name, or a file.
+
+    Raises:
+        DataError: neither a file nor a shipped name, or no split.
+    """
     path = Path(name_or_path)
     if not path.is_file():
         wheel, source = config_folders()  # beside the named configurations
@@ -95,7 +103,11 @@ def read_split_file(name_or_path: str) -> Split:
 
 
 def usable(recordings: Sequence[Recording], length: int) -> list[Recording]:
-    """Recordings that hold at least one snippet; ``DataError`` where none does."""
+    """Recordings that hold at least one snippet of that many frames.
+
+    Raises:
+        DataError: none is long enough.
+    """
     kept = [r for r in recordings if len(r) >= length]
     if not kept:
         raise DataError(
@@ -112,6 +124,7 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     Raises:
         DataError: no roots, a name that fits no recording or kind of recordings, a range that begins
             after the end of its recording, or nothing left to train or to validate on.
+        ConfigError: a name that is not written like that of a recording or its frames.
     """
     if not config.roots:
         raise DataError("no data to train on: name data sets with --dataset ROOT or data.roots")

@@ -74,9 +74,17 @@ def load_window(cache: ArrayCache, snippet: Snippet, length: int) -> list[NDArra
 def first_readable(
     snippets: Iterator[Snippet], read: Callable[[Snippet], T], named: set[str]
 ) -> tuple[Snippet, T]:
-    """The first snippet that can be read, and what was read of it; ``DataError`` where 20 in a row cannot.
+    """The first snippet that can be read, and what was read of it.
 
     The reasons of those passed over are logged once each, the first ten of them, which ``named`` remembers.
+
+    Args:
+        snippets: to try, in order.
+        read: what is read of one.
+        named: reasons that were logged; new ones are added.
+
+    Raises:
+        DataError: twenty in a row cannot be read.
     """
     for snippet in islice(snippets, _MOST_IN_A_ROW):
         try:

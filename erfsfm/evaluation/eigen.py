@@ -49,6 +49,9 @@ def read_split(split: str, root: Path) -> list[RawFrame]:
     Args:
         split: ``eigen``, a file of the list ``test``, or any other file with a frame a line.
         root: of KITTI raw: the folder of the dates, a date, or a drive.
+
+    Raises:
+        DataError: no data there, or a split that is missing, damaged or empty, or not of KITTI raw.
     """
     if not root.is_dir():
         raise DataError(
@@ -184,7 +187,11 @@ class RawFrame:
 
     @staticmethod
     def parse(line: str, root: Path) -> RawFrame:
-        """Read a line of a split: an image's path, or ``drive frame`` with an optional ``l`` or ``r``."""
+        """Read a line of a split: an image's path, or ``drive frame`` with an optional ``l`` or ``r``.
+
+        Raises:
+            DataError: the line names no frame.
+        """
         match = _FRAME.fullmatch(line.strip())
         if match is None:
             raise DataError(
@@ -204,7 +211,11 @@ class RawFrame:
         return self.root / self.drive[:10] / f"{self.drive}_sync"
 
     def image_path(self, index: int | None = None) -> Path:
-        """The image of a frame of this drive, its own if None: png or jpg, whichever there is."""
+        """The image of a frame of this drive, its own if None: png or jpg, whichever there is.
+
+        Raises:
+            DataError: the image is missing.
+        """
         stem = (
             self.folder
             / f"image_0{self.camera}"
@@ -219,7 +230,11 @@ class RawFrame:
         )
 
     def window(self, sources: int) -> list[int]:
-        """The frame with ``sources`` others around it, shifted where the drive begins or ends."""
+        """The frame with ``sources`` others around it, shifted where the drive begins or ends.
+
+        Raises:
+            DataError: the drive has too few images.
+        """
         folder = self.folder / f"image_0{self.camera}" / "data"
         count = (
             sum(1 for path in folder.iterdir() if path.suffix in (".png", ".jpg"))

@@ -90,7 +90,6 @@ def measure(
     costs = sweep(target.coarse, small_views, small)
     coarse = lowest(smoothed(costs, target.coarse_grey))
     change = _enlarged(np.asarray(cv2.medianBlur(coarse, 5), np.float32), target)
-
     for _ in range(STEPS):
         step, information, fit = _gauss_newton(target.levels, views, inverse * np.exp(change))
         change += step

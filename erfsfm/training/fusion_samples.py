@@ -48,7 +48,16 @@ class Sample(NamedTuple):
 
 
 class FusionSamples:
-    """Random frames of simulated drives, seen as a run sees its keyframes: poses, images and unit have errors."""
+    """Random frames of simulated drives, seen as a run sees its keyframes: poses, images and unit have errors.
+
+    Args:
+        recordings: simulated drives.
+        networks: that guess depth.
+        seed: of all random draws.
+
+    Raises:
+        TrainingError: no drive has depth maps and poses, or one has too flat images.
+    """
 
     def __init__(
         self, recordings: Sequence[Recording], networks: DepthPosePredictor, seed: int

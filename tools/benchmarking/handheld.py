@@ -86,7 +86,11 @@ def add_options(add: Callable[..., Any]) -> None:
 
 
 def drives(options: Namespace, folder: Path) -> list[BenchmarkSequence]:
-    """Everything that the options name; rooms are made in ``folder`` where they are missing."""
+    """Everything that the options name; rooms are made in ``folder`` where they are missing.
+
+    Raises:
+        SystemExit: a root holds no sequence of its kind.
+    """
     found = []
     for option, kind in ROOTS.items():
         root = getattr(options, option)

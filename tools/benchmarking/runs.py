@@ -116,7 +116,17 @@ def plan(
     changes: Sequence[str],
     device: str,
 ) -> list[Job]:
-    """Every combination, configuration by configuration."""
+    """Every combination, configuration by configuration.
+
+    Args:
+        folder: of all run folders.
+        drives: recordings and simulated worlds.
+        configurations: overrides by name.
+        weights: names or folders.
+        seeds: of the runs.
+        changes: overrides of every configuration.
+        device: where networks compute.
+    """
     jobs = []
     for name, seed, each, drive in product(configurations, seeds, weights, drives):
         overrides = (*configurations[name], *changes)

@@ -110,6 +110,11 @@ def read_camera_file(path: Path, own: Mapping[str, Any] | None = None) -> Camera
     """Read and check a ``camera.yaml``; an unlikely camera is logged as a warning.
 
     Keys that it lacks are those of the recording's ``own`` camera, if any.
+
+    Raises:
+        DataError: the file cannot be read or holds no keys, a key is missing, unknown or wrong, or
+            no
+            camera is like that.
     """
     try:
         content = read_yaml(path)
@@ -198,7 +203,11 @@ def impossible(camera: Pinhole) -> str | None:
 
 
 def require_plausible(camera: Pinhole, where: str) -> None:
-    """Refuse an impossible camera, and warn once of an unlikely one; ``where`` it was read is for the message."""
+    """Refuse an impossible camera, and warn once of an unlikely one; ``where`` it was read is for the message.
+
+    Raises:
+        DataError: no camera has such a size, focal length or principal point.
+    """
     problem = impossible(camera)
     if problem is not None:
         raise DataError(f"{where}: {problem}")

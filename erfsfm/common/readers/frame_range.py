@@ -32,7 +32,11 @@ class FrameRange:
 
     @staticmethod
     def parse(name: str) -> FrameRange:
-        """Read a name; raw drives lose their ``_sync``."""
+        """Read a name; raw drives lose their ``_sync``.
+
+        Raises:
+            ConfigError: it names no frames.
+        """
         name = name.strip()
         match = _RANGED.fullmatch(name)
         if match is None:

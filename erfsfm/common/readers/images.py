@@ -48,7 +48,11 @@ _NUMBER = re.compile(
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The image files directly in a folder, in natural order (``2.png`` before ``10.png``)."""
+    """The image files directly in a folder, in natural order (``2.png`` before ``10.png``).
+
+    Raises:
+        DataError: an image is there in two formats.
+    """
     if not folder.is_dir():
         return []
     paths = [path for path in folder.iterdir() if is_image(path)]
@@ -69,7 +73,11 @@ def has_images(folder: Path) -> bool:
 
 
 def image_folder(folder: Path) -> Path | None:
-    """The folder that holds the images: itself, or its one sub-folder of a usual name."""
+    """The folder that holds the images: itself, or its one sub-folder of a usual name.
+
+    Raises:
+        DataError: several sub-folders have images.
+    """
     if has_images(folder):
         return folder
     found = [folder / name for name in IMAGE_FOLDERS if has_images(folder / name)]
@@ -159,6 +167,9 @@ def read_depth_map(path: Path, per_metre: float = 256.0, unknown: int = 0) -> ND
     """A depth map ``(H, W)`` in metres, 0 where unknown, from a 16-bit grey PNG.
 
     ``per_metre`` is the stored value of one metre, ``unknown`` one of pixels without depth, beside 0.
+
+    Raises:
+        DataError: the file cannot be read, or is no 16-bit grey image.
     """
     values = read_values(path)
     if values.ndim != 2 or values.dtype != np.uint16:
@@ -169,7 +180,11 @@ def read_depth_map(path: Path, per_metre: float = 256.0, unknown: int = 0) -> ND
 
 
 def decode_values(data: bytes, where: str, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray[Any]:
-    """As `read_values`, of the bytes of a file; ``where`` they come from is for messages, ``flags`` are OpenCV's."""
+    """As `read_values`, of the bytes of a file; ``where`` they come from is for messages, ``flags`` are OpenCV's.
+
+    Raises:
+        DataError: they are no image, or a part of one.
+    """
     if not data:
         raise DataError(f"{where} is empty: copy it again")
     if not _is_complete(data):
@@ -224,7 +239,11 @@ def first_size(files: Sequence[Path]) -> tuple[int, int]:
 
 
 def report_unreadable(reasons: Sequence[str], total: int, what: str) -> None:
-    """Warn once that some of many are left out, by the reason of the first; ``DataError`` where none can be read."""
+    """Warn once that some of many are left out, by the reason of the first; ``DataError`` where none can be read.
+
+    Raises:
+        DataError: all of them cannot be read.
+    """
     if reasons and len(reasons) == total:
         raise DataError(
             reasons[0] if total == 1 else f"none of {total} {what} can be read: {reasons[0]}"

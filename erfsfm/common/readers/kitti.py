@@ -88,7 +88,11 @@ class OdometryRoot:
         return [folder.name for folder in self.folders() if odometry_camera(folder) is not None]
 
     def simulation_seed(self) -> int | None:
-        """The seed of a simulated world; None of a real root."""
+        """The seed of a simulated world; None of a real root.
+
+        Raises:
+            DataError: the file of a simulated world holds no seed.
+        """
         path = self.base / SIMULATION_FILE
         if not path.is_file():
             return None
@@ -124,7 +128,11 @@ def odometry_camera(folder: Path) -> int | None:
 
 
 def find_drives(dataset: Path) -> dict[str, Path]:
-    """Rectified drives by name (``2011_09_26_drive_0013``): the folder itself, those in it, or those in its dates."""
+    """Rectified drives by name (``2011_09_26_drive_0013``): the folder itself, those in it, or those in its dates.
+
+    Raises:
+        DataError: the folder is an unrectified drive.
+    """
     own = _DRIVE.fullmatch(dataset.absolute().name)
     if own is not None:
         if own["kind"] == "extract":
@@ -153,7 +161,11 @@ class CalibrationFile:
     """The numeric rows of one calibration file."""
 
     def __init__(self, path: Path) -> None:
-        """Read a file."""
+        """Read a file.
+
+        Raises:
+            DataError: there is no such file, or it cannot be read.
+        """
         self.path = path
         if not path.is_file():
             shipped = _SHIPPED.get(path.name)
@@ -176,7 +188,11 @@ class CalibrationFile:
         return key in self._rows
 
     def matrix(self, key: str, shape: tuple[int, ...]) -> FloatArray:
-        """The numbers of a row, row-major."""
+        """The numbers of a row, row-major.
+
+        Raises:
+            DataError: there is no such row, or it holds other than that many finite numbers.
+        """
         count = int(np.prod(shape))
         words = self._rows.get(key)
         if words is None:
@@ -198,7 +214,11 @@ class CalibrationFile:
         return _rigid(self.matrix(R_key, (3, 3)), self.matrix(t_key, (3,)))
 
     def T_camera_cam0(self, key: str) -> FloatArray:
-        """Rectified camera 0 to the rectified camera of projection matrix ``key``, ``(4, 4)``, metres."""
+        """Rectified camera 0 to the rectified camera of projection matrix ``key``, ``(4, 4)``, metres.
+
+        Raises:
+            DataError: the row is missing or is no projection matrix.
+        """
         P = self.matrix(key, (3, 4))
         if not abs(np.linalg.det(P[:, :3])) > 0:
             raise DataError(
@@ -211,6 +231,9 @@ class CalibrationFile:
         """The camera of a projection matrix of ``calib.txt``, for images of the given size.
 
         The file has no image size: it is that of the images where the principal point is near their middle.
+
+        Raises:
+            DataError: the row is no projection matrix, or one of images of another size.
         """
         camera = self._pinhole(key, width, height)
         scales = 2 * (camera.cx + 0.5) / width, 2 * (camera.cy + 0.5) / height
@@ -226,7 +249,12 @@ class CalibrationFile:
         return camera
 
     def rectified_pinhole(self, camera: str, width: int, height: int) -> Pinhole:
-        """A camera (``"02"``) of ``calib_cam_to_cam.txt``, for images resized to the given size."""
+        """A camera (``"02"``) of ``calib_cam_to_cam.txt``, for images resized to the given size.
+
+        Raises:
+            DataError: rows are missing or damaged, or the images have another shape than the
+                camera.
+        """
         size = self.matrix(f"S_rect_{camera}", (2,))
         if not (size > 0).all():
             raise DataError(
@@ -259,7 +287,11 @@ def _rigid(R_a_b: FloatArray, t_a_b: FloatArray) -> FloatArray:
 
 
 def read_packet(path: Path) -> FloatArray:
-    """One packet ``(30,)``."""
+    """One packet ``(30,)``.
+
+    Raises:
+        DataError: it cannot be read, or does not hold 30 finite numbers.
+    """
     try:
         row = list(map(float, read_text(path).split()))
     except (OSError, ValueError) as error:
@@ -272,7 +304,11 @@ def read_packet(path: Path) -> FloatArray:
 
 
 def velocity(oxts: Path, frame: int) -> FloatArray:
-    """Of the car in m/s: north, east, up ``(3,)``, from the packet of a frame in ``oxts/data``."""
+    """Of the car in m/s: north, east, up ``(3,)``, from the packet of a frame in ``oxts/data``.
+
+    Raises:
+        DataError: the packet is missing or damaged.
+    """
     path = oxts / f"{frame:010d}.txt"
     if not path.is_file():
         raise DataError(
@@ -285,6 +321,9 @@ def read_velodyne(path: Path, columns: int = VELODYNE_COLUMNS) -> NDArray[np.flo
     """The points of a file of float32 ``(P, 3)``, metres, in the LiDAR frame; x, y, z are the first of ``columns``.
 
     Points at the LiDAR's own place or beyond 10 km, which it cannot measure, are left out.
+
+    Raises:
+        DataError: the file cannot be read, is no scan, or has no measured point.
     """
     try:
         content = read_bytes(path, _MOST_BYTES)

@@ -84,7 +84,11 @@ class NumberedFiles:
 
 
 def by_number(paths: list[Path]) -> NumberedFiles:
-    """Files that KITTI names by their number alone, at least one, in order."""
+    """Files that KITTI names by their number alone, at least one, in order.
+
+    Raises:
+        DataError: a name is no number, or two files have the same.
+    """
     for path in paths:
         if not path.stem.isdecimal():
             raise DataError(
@@ -120,6 +124,9 @@ def by_table(listed: list[Path], table: Path) -> NumberedFiles:
     """The files that a table lists in the order of time; missing files are gaps.
 
     Rows before the first file and after the last are left out; ``first`` is the number of rows before the first file.
+
+    Raises:
+        DataError: none of the files is there.
     """
     there = [row for row, path in enumerate(listed) if path.is_file()]
     if not there:

@@ -39,7 +39,11 @@ class VideoFrames:
     """
 
     def __init__(self, path: Path, counted_frames: int = _COUNTED_FRAMES) -> None:
-        """Open a video; one that announces more than ``counted_frames`` is long."""
+        """Open a video; one that announces more than ``counted_frames`` is long.
+
+        Raises:
+            DataError: the video cannot be opened, or has no frame.
+        """
         self._path = path
         self._next = 0
         self._times_ms: list[float] = []
@@ -147,7 +151,6 @@ def _packet_times(path: Path) -> NDArray[np.float64] | None:
 
 def list_videos(folder: Path) -> list[Path]:
     """The video files directly in a folder, without hidden ones."""
-
     found = []
     for path in folder.iterdir():
         is_video = path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()

@@ -20,7 +20,8 @@ from slam.frames import KEYFRAME_SOURCE, RelativePose, SnippetPoses, runs
 from slam.frontend.drive import Drive
 from slam.frontend.keyframes.relative_poses import KeyframePoses, chained
 from slam.frontend.scale import Scale
-from slam.frontend.visual.motion import step_noise, triangulated
+from slam.frontend.visual.motion import triangulated
+from slam.frontend.visual.noise import step_noise
 from slam.geometry.robust import MAD_TO_SIGMA, running_median
 from slam.geometry.se3 import (
     FloatArray,

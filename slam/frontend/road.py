@@ -1,16 +1,14 @@
-"""The road: the length of a step in camera heights by its homography, and the ground plane fitted to learned depth.
+"""The road between two images: the length of a step in camera heights, by a homography.
 
-A plane ``n . X = h`` of the current camera maps to the previous one by the homography ``R + t n^T / h``
-(Hartley and Zisserman 2004, Eq. 13.2). Rotation and direction of ``t`` are known from corners; the vector
-``m = |t| n / h`` that aligns both images of the road is estimated; its norm is the length. Learned depth is
-not used, so this length has neither the bias nor the drift of the networks.
+A plane ``n . X = h`` of the current camera maps to the previous one by the homography
+``R + t n^T / h`` (Hartley and Zisserman 2004, Eq. 13.2). Rotation and direction of ``t`` are known
+from corners; the vector ``m = |t| n / h`` that aligns both images of the road is estimated; its
+norm is the length. Learned depth is not used, so this length has neither the bias nor the drift of
+the networks.
 
-Brightness that changes slowly over the image (light, reflections) is removed from the difference of the images.
-Taken from each image before, it would not be the same part of the road in both, for the road is larger in the later
-one: lengths came out 1 % short.
-
-With the plane ``n . X = h`` and a pixel's ray ``r`` (z = 1), ``1 / z = (n / h) . r``: inverse depth is linear in the
-ray, and the ray has no noise, so errors of depth do not bias the fit as they bias a fit to points.
+Brightness that changes slowly over the image (light, reflections) is removed from the difference of
+the images. Taken from each image before, it would not be the same part of the road in both, for the
+road is larger in the later one: lengths came out 1 % short.
 """
 
 from __future__ import annotations
@@ -23,54 +21,36 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import DepthMap, Ends, Frame, Intrinsics, Mask, resized_mask, slopes_of
+from slam.frames import Ends, Frame, Intrinsics, Mask, resized_mask, slopes_of
 from slam.frontend.visual.motion import Steps, links, triangulated
-from slam.frontend.visual.self_calibration import DepthError
 from slam.geometry.robust import mad_sigma, running_median
 from slam.geometry.se3 import FloatArray, chain, invert, path_distance
 from slam.runtime.errors import Failed
 
 _LEVEL = np.array([0.0, 1.0, 0.0])
-_LENGTHS_HEIGHTS = np.geomspace(
-    0.02, 2.5, 32, dtype=np.float32
-)  # searched; refinement converges between them
+# searched; refinement converges between them
+_LENGTHS_HEIGHTS = np.geomspace(0.02, 2.5, 32, dtype=np.float32)
 _CLIPPED_GREY = 8.0
 _ITERATIONS = 6
 _CONVERGED = 1e-3  # of the length, whose sigma is fifty times as large
 _STEPS_KEPT = 100
-
-_Layer = NDArray[np.float32]
-# strips of ground, a long one and a short one before a vehicle: farthest ground and half width, in camera heights, and
-# the relative sigma of independent errors that add up as those of neighbouring lengths do, which are correlated; single
-# lengths err by a third to a half of it
+# strips of ground, a long one and a short one before a vehicle: farthest ground and half width, in
+# camera heights, and the relative sigma of independent errors that add up as those of neighbouring
+# lengths do, which are correlated; single lengths err by a third to a half of it
 _SHAPES = (9.0, 1.0, 0.06), (4.5, 2.0, 0.1)
 _POINTS = 2500  # approximate number of aligned pixels
 _MIN_POINTS = 300  # least number of aligned pixels of a measurement
 _TILT_SIGMA_DEG = 0.07  # sigma of the ground plane's tilt against the direction of motion, degrees
 _MAX_TILT_DEG = 4.0  # largest tilt of the ground plane, degrees
 _MIN_CORRELATION = 0.3  # least correlation of the aligned pixels
-_MIN_GAIN = (
-    0.25  # least fraction of the photometric error without motion that the alignment removes
-)
+# least fraction of the photometric error without motion that the alignment removes
+_MIN_GAIN = 0.25
 _REACH_HEIGHTS = 2.5  # of the path before and after a frame, in camera heights: 4 m of a car
 _USUAL_STEPS = 101  # whose median direction is the usual one
 _PITCH_SIGMA_DEG = 0.3  # of a car against its usual pitch, degrees
 _OF_PATH = 0.5  # noise of the path's direction over that of a single step
-_PLANE_POINTS = 1500
-_LEAST_POINTS = 50
-_HYPOTHESES = 150
-_REWEIGHTINGS = 8
-_ROAD_ROWS = (
-    0.35,
-    0.97,
-)  # top and bottom edge of the road, from horizon (0) to image bottom (1): above a bonnet
-_ROAD_TOP_WIDTH = 0.16  # width of the top edge over that of the image
-_ROAD_BOTTOM_WIDTH = 0.5  # width of the bottom edge over that of the image
-_MAX_PLANE_TILT_DEG = (
-    12.0  # largest angle between the plane's normal and the camera's y axis, degrees
-)
-_INLIER_RELATIVE_DEPTH = 0.05  # largest relative depth error of a plane inlier
-_MIN_INLIER_RATIO = 0.5  # least inlier ratio of a usable frame
+
+_Layer = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -399,101 +379,3 @@ def _ahead(points: _Layer) -> _Layer:
 
 def _correlation(a: _Layer, b: _Layer) -> float:
     return float((a * b).sum() / max(float(np.sqrt((a**2).sum() * (b**2).sum())), 1e-9))
-
-
-class GroundPlaneFitter:
-    """Fits the road in a trapezoid in front of the car, by RANSAC and reweighted least squares on inverse depth."""
-
-    def __init__(self, intrinsics: Intrinsics, seed: int = 0) -> None:
-        """Sample the pixels of the trapezoid; ``seed`` is that of RANSAC."""
-        self._seed = seed
-        # rows, columns (P,) and rays (P, 3) of about so many pixels; the horizon is taken at cy (a level camera)
-        horizon, bottom = intrinsics.cy, intrinsics.height - 1.0
-        top_row, bottom_row = (horizon + share * (bottom - horizon) for share in _ROAD_ROWS)
-        area = (
-            intrinsics.width * (bottom_row - top_row) * (_ROAD_TOP_WIDTH + _ROAD_BOTTOM_WIDTH) / 2
-        )
-        step = max(1.0, float(np.sqrt(max(area, 1.0) / _PLANE_POINTS)))
-        rows_seen = np.unique(
-            np.clip(np.arange(top_row, bottom_row, step), 0, bottom).astype(np.int64)
-        )
-        rows, columns = [], []
-        for row in rows_seen:
-            share = (row - top_row) / (bottom_row - top_row)
-            width = _ROAD_TOP_WIDTH + share * (_ROAD_BOTTOM_WIDTH - _ROAD_TOP_WIDTH)
-            half = width * intrinsics.width / 2
-            across = np.arange(intrinsics.cx - half, intrinsics.cx + half, step)
-            across = np.unique(across[(across >= 0) & (across < intrinsics.width)].astype(np.int64))
-            columns.append(across)
-            rows.append(np.full(len(across), row))
-        empty = [np.empty(0, dtype=np.int64)]
-        v, u = np.concatenate(rows or empty), np.concatenate(columns or empty)
-        self._rows, self._columns, self._rays = v, u, intrinsics.rays(np.stack([u, v], axis=-1))
-
-    def fit(self, depth_unscaled: DepthMap, error: DepthError) -> float | Failed:
-        """The camera's unscaled height over the plane of learned z-depth ``(H, W)`` without the bias by its ``error``.
-
-        The depth is at the size of the intrinsics; where it is unknown it is left out.
-        """
-        depth = error.corrected(depth_unscaled[self._rows, self._columns].astype(np.float64))
-        inverse_depth = 1.0 / np.maximum(depth, 1e-9)
-        usable = (inverse_depth > 0) & (inverse_depth < 1e8)  # false for NaN
-        if usable.sum() < _LEAST_POINTS:
-            return Failed("the depth in front of the car is not usable")
-        rays, inverse_depth = self._rays[usable], inverse_depth[usable]  # (P, 3), (P,)
-        scaled_normal = _ransac(rays, inverse_depth, self._seed)
-        if scaled_normal is None:
-            return Failed(
-                f"no plane within {_MAX_PLANE_TILT_DEG:g} deg of level in front of the car"
-            )
-        scaled_normal = _reweighted(rays, inverse_depth, scaled_normal)
-        height = 1.0 / float(np.linalg.norm(scaled_normal))
-        inlier_ratio = float(_inliers(rays, inverse_depth, scaled_normal[None])[0].mean())
-        if scaled_normal[1] * height < np.cos(np.deg2rad(_MAX_PLANE_TILT_DEG)):
-            return Failed(
-                f"the plane in front of the car is tilted by more than {_MAX_PLANE_TILT_DEG:g} deg"
-            )
-        if inlier_ratio < _MIN_INLIER_RATIO:
-            return Failed(
-                f"only {inlier_ratio:.0%} of the pixels in front of the car lie on one plane"
-            )
-        return height
-
-
-def _ransac(rays: FloatArray, inverse_depth: FloatArray, seed: int) -> FloatArray | None:
-    """``n / h`` ``(3,)`` of the level plane with most inliers, or None."""
-    rng = np.random.default_rng(seed)
-    samples = rng.integers(len(rays), size=(_HYPOTHESES, 3))
-    minimal = rays[samples]  # (S, 3, 3)
-    solvable = np.abs(np.linalg.det(minimal)) > 1e-6
-    if not solvable.any():
-        return None
-    planes = np.linalg.solve(minimal[solvable], inverse_depth[samples[solvable]][..., None])[
-        ..., 0
-    ]  # (S, 3)
-    level = planes[:, 1] > np.cos(np.deg2rad(_MAX_PLANE_TILT_DEG)) * np.linalg.norm(planes, axis=1)
-    if not level.any():
-        return None
-    planes = planes[level]
-    votes = _inliers(rays, inverse_depth, planes).sum(axis=1)
-    best: FloatArray = planes[votes.argmax()]
-    return best
-
-
-def _inliers(rays: FloatArray, inverse_depth: FloatArray, planes: FloatArray) -> NDArray[np.bool_]:
-    """Inliers ``(S, P)`` of planes ``n / h`` ``(S, 3)`` by the relative error of depth."""
-    over_measured = (rays / inverse_depth[:, None]).T.astype(np.float32)
-    relative = planes.astype(np.float32) @ over_measured
-    relative -= 1.0
-    return np.asarray(np.abs(relative, out=relative) < _INLIER_RELATIVE_DEPTH)
-
-
-def _reweighted(rays: FloatArray, inverse_depth: FloatArray, plane: FloatArray) -> FloatArray:
-    """Refine ``n / h`` by least squares with Cauchy weights on the relative error of inverse depth."""
-    for _ in range(_REWEIGHTINGS):
-        predicted = np.maximum(rays @ plane, 1e-9)
-        residual = inverse_depth / predicted - 1.0
-        weights = 1.0 / (predicted**2 * (1.0 + (residual / (0.5 * _INLIER_RELATIVE_DEPTH)) ** 2))
-        weighted = rays * weights[:, None]
-        plane = np.linalg.solve(weighted.T @ rays, weighted.T @ inverse_depth)
-    return plane

@@ -19,14 +19,8 @@ from erfsfm.common.processes import side_by_side
 from slam.config.sections import LoopsConfig
 from slam.frames import Intrinsics, RelativePose, View
 from slam.geometry.se3 import FloatArray, invert, path_distance, rotation_angle
-from slam.loops.recognition import (
-    OF_FRAMES,
-    Loop,
-    LoopThresholds,
-    LoopVerifier,
-    PlaceIndex,
-    RejectedLoop,
-)
+from slam.loops.verification import OF_FRAMES, Loop, LoopThresholds, LoopVerifier, RejectedLoop
+from slam.loops.vocabulary import PlaceIndex
 
 logger = logging.getLogger(__name__)
 

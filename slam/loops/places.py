@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from slam.frames import Intrinsics, View
 from slam.geometry.se3 import FloatArray, apply, invert
-from slam.loops.recognition import LoopThresholds, matches
+from slam.loops.verification import LoopThresholds, matches
 from slam.runtime.errors import RunError
 
 _FORMAT = 1

@@ -31,7 +31,8 @@ from slam.frames import (
     trusted_depth,
 )
 from slam.frontend.tracking import CornerTracker, PredictedFlow, Tracks
-from slam.frontend.visual.motion import Motion, MotionHistory, RelativeRotation, pose_sigmas
+from slam.frontend.visual.history import MotionHistory
+from slam.frontend.visual.motion import Motion, RelativeRotation, pose_sigmas
 from slam.frontend.visual.self_calibration import DepthError, FocalLength
 from slam.frontend.visual.two_view import (
     CORNER_CORRELATION,

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frontend.visual.motion import AXIS_SIGMA, MotionHistory, MotionPrior
+from slam.frontend.visual.history import AXIS_SIGMA, MotionHistory, MotionPrior
 from slam.geometry.multiview import (
     UnitRelativePose,
     cross,

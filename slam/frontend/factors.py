@@ -36,9 +36,8 @@ from slam.geometry.se3 import (
 logger = logging.getLogger(__name__)
 NETWORK_SOURCE = "network"
 STUDENT_T_DOF = 12.0  # of the errors of measured steps: degrees of freedom of Student's t
-LEAST_PAIRS = (
-    20  # steps that image geometry measured too, from which on unit and noise are measured
-)
+# steps that image geometry measured too, from which on unit and noise are measured
+LEAST_PAIRS = 20
 _NEAREST_PAIRS = 40  # in time, by which they are measured
 _LONGEST_PAIR = 4  # frames: as far as a snippet reaches
 _SHORTEST_PAIR = 0.1  # over the median length of a step: shorter ones say nothing about the unit
@@ -75,15 +74,18 @@ def make_factors(
     if not calibration.is_measured:  # lengths in the wrong unit have no say beside measured ones
         by_geometry = {pose.ends for pose in geometric}
         networks = [factor for factor in networks if factor.ends not in by_geometry]
-    interpolated = [scale.scaled(pose) for pose in drive.gap_steps]
-    by_network, interpolated, by_image = (
-        [pose for pose in poses if not maps.is_inside(pose)]
-        for poses in (networks, interpolated, geometric)
-    )
+    by_network = _outside(maps, networks)
+    by_image = _outside(maps, geometric)
+    interpolated = _outside(maps, [scale.scaled(pose) for pose in drive.gap_steps])
     interpolated = join_gap_ends(
         interpolated, [*by_network, *by_image], by_keyframes, maps.segments
     )
     return [*by_network, *interpolated, *lidar_steps, *by_image, *by_keyframes]
+
+
+def _outside(maps: KeyframePoses, poses: Sequence[RelativePose]) -> list[RelativePose]:
+    """The poses between frames that do not both lie in one connected component of maps."""
+    return [pose for pose in poses if not maps.is_inside(pose)]
 
 
 def scaled_poses(
@@ -150,10 +152,8 @@ class NetworkCalibration:
                 f"fewer than {LEAST_PAIRS} steps measure its unit, that of learned depth is taken"
             )
         least, usual, most = np.quantile(self.unit / depth_unit, (0.0, 0.5, 1.0))
-        rotation, translation = (
-            np.rad2deg(np.median(self.sigmas[:, :3])),
-            np.median(self.sigmas[:, 5]),
-        )
+        rotation = np.rad2deg(np.median(self.sigmas[:, :3]))
+        translation = np.median(self.sigmas[:, 5])
         return (
             f"by {self.pairs} steps its unit is {usual:.2f} ({least:.2f} to {most:.2f}) of that of learned depth, and "
             f"its noise {rotation:.2f} degrees and {100 * translation:.0f} % of a step"
@@ -161,9 +161,10 @@ class NetworkCalibration:
 
     def scaled(self, steps: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
         """Steps ``T_k_next`` by k in the unit."""
-        scaled = {k: T_k_next.copy() for k, T_k_next in steps.items()}
-        for k, T_k_next in scaled.items():
-            T_k_next[:3, 3] *= self.unit[k]
+        scaled = {}
+        for k, T_k_next in steps.items():
+            scaled[k] = T_k_next.copy()
+            scaled[k][:3, 3] *= self.unit[k]
         return scaled
 
 
@@ -186,15 +187,20 @@ def calibrate_network(
     learned depth, and accordingly uncertain. Steps ``T_k_next`` are unscaled; ``depth_unit`` ``(N,)`` is the unit of
     the ``geometric`` poses per unit of learned depth at each frame.
     """
-    measured = (p for p in geometric if 0 < p.to_index - p.from_index <= _LONGEST_PAIR)
-    pairs = [p for p in measured if steps.keys() >= set(range(*p.ends))]
+    pairs, by_network = [], []
+    for pose in geometric:
+        between = range(*pose.ends)
+        if 0 < len(between) <= _LONGEST_PAIR and steps.keys() >= set(between):
+            pairs.append(pose)
+            by_network.append(reduce(np.matmul, (steps[k] for k in between)))
     if len(pairs) < LEAST_PAIRS:
         return _by_depth(depth_unit, len(pairs))
-    first, last = np.array([p.ends for p in pairs]).T
-    T_network = np.array([reduce(np.matmul, (steps[k] for k in range(*p.ends))) for p in pairs])
-    T_geometric = np.array([p.T_from_to for p in pairs])
+    first, last = np.array([pose.ends for pose in pairs]).T
+    T_network = np.array(by_network)
+    T_geometric = np.array([pose.T_from_to for pose in pairs])
     t_network, t_geometric = T_network[:, :3, 3], T_geometric[:, :3, 3]
-    length, frames = np.linalg.norm(t_geometric, axis=1), last - first
+    length = np.linalg.norm(t_geometric, axis=1)
+    frames = last - first
     # along the measured motion, where the network's noise has no bias, as it has in the length
     ratio = (t_network * t_geometric).sum(axis=1) / np.maximum(length, 1e-12) ** 2
     used = (ratio > 0) & (length > _SHORTEST_PAIR * np.median(length / frames) * frames)
@@ -205,10 +211,9 @@ def calibrate_network(
     reach = np.where(np.arange(6) < 3, frames[:, None], length[:, None])
     error = np.abs(tangent(invert(T_network[used]) @ T_geometric[used])) / reach[used]
     # the unit follows image geometry, and so shares its errors
-    shared = np.array([p.sigmas for p in pairs])[used] / reach[used]
-    own, of_geometry = (
-        _nearest_median(first[used], values, len(unit)) for values in (error, shared)
-    )
+    shared = np.array([pose.sigmas for pose in pairs])[used] / reach[used]
+    own = _nearest_median(first[used], error, len(unit))
+    of_geometry = _nearest_median(first[used], shared, len(unit))
     sigmas = np.hypot(MAD_TO_SIGMA * own, of_geometry)
     return NetworkCalibration(unit, np.maximum(sigmas, _LEAST_SIGMAS), int(used.sum()))
 
@@ -248,7 +253,9 @@ def chain_raw(snippets: Sequence[SnippetPoses], count: int) -> FloatArray:
     """
     steps: dict[int, FloatArray] = {}
     for snippet in snippets:
-        steps |= {k: T for k, T in _steps(snippet).items() if k == snippet.target or k not in steps}
+        for k, T_k_next in _steps(snippet).items():
+            if k == snippet.target or k not in steps:
+                steps[k] = T_k_next
     return chain(np.array([steps[k] for k in range(count - 1)]))
 
 
@@ -297,10 +304,12 @@ def join_gap_ends(
     """
     T_map_camera = chained(by_map)
     loose = {pose.from_index: pose for pose in interpolated}
-    T_step = {
-        pose.from_index: pose.T_from_to for pose in measured if pose.to_index == pose.from_index + 1
-    }
-    T_step |= {first: pose.T_from_to for first, pose in loose.items()}
+    T_step = {}
+    for pose in measured:
+        if pose.to_index == pose.from_index + 1:
+            T_step[pose.from_index] = pose.T_from_to
+    for pose in interpolated:
+        T_step[pose.from_index] = pose.T_from_to
     for first, last in pairwise(sorted(maps)):
         steps = range(first, last)
         if (

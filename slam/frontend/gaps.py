@@ -40,57 +40,56 @@ def interpolate_gaps(
     Raises:
         SlamError: no snippet was measured, so there is no motion to extrapolate.
     """
-    count, snippets, unusable, repeated = len(drive), drive.snippets, drive.unusable, drive.repeated
-    if not snippets:
-        why = next(iter(unusable.values()), "the sequence is too short")
+    count = len(drive)
+    if not drive.snippets:
+        why = next(iter(drive.unusable.values()), "the sequence is too short")
         raise SlamError(f"no {sources + 1} usable frames in a row among {count}: {why}")
-    new = set(range(count)).difference(unusable, repeated)
-    raw = network_steps(snippets)
+    new = set(range(count)).difference(drive.unusable, drive.repeated)
+    raw = network_steps(drive.snippets)
     calibration = calibrate_network(raw, _poses(drive.steps), np.ones(count))
     by_network = calibration.scaled(raw)
-    frozen, steps = _without_frozen(by_network, drive.steps, map_poses, repeated, new)
-    frames = dict(unusable) | dict.fromkeys(frozen, "the image stands still while the camera moves")
-    spans = ((s, {s.target, *s.sources}) for s in snippets)
-    trusted = [
-        s
-        for s, span in spans
-        if not frozen & span and not any(min(span) < cut <= max(span) for cut in cuts)
-    ]
-    filled = _filled(snippets, _completed(raw, range(count - 1)), count, sources)
-    by_image = {
-        m.ends[0]: m.relative_pose.T_from_to
-        for m in steps.values()
-        if m.ends == (m.ends[0], m.ends[0] + 1)
-    }
+    frozen, steps = _without_frozen(by_network, drive.steps, map_poses, drive.repeated, new)
+    frames = drive.unusable | dict.fromkeys(frozen, "the image stands still while the camera moves")
+    trusted = [snippet for snippet in drive.snippets if _is_trusted(snippet, frozen, cuts)]
+    by_image = {}
+    for (first, last), step in steps.items():
+        if last == first + 1:
+            by_image[first] = step.relative_pose.T_from_to
     # snippets of frozen images alone are still the best estimate available
     known = calibration.scaled(network_steps(trusted)) | by_image or by_network
-    covered = {
-        step for s in trusted for step in range(min(s.sources), max(s.sources))
-    } | by_image.keys()
-    loose = [step for step in range(count - 1) if step not in covered]
+    covered = set(by_image)
+    for snippet in trusted:
+        covered.update(range(min(snippet.sources), max(snippet.sources)))
+    loose = [k for k in range(count - 1) if k not in covered]
     motion = _completed(known, loose)
     for pose in _poses(steps):  # over gaps
         over = range(*pose.ends)
         if len(over) > 1 and set(loose).issuperset(over):
             motion |= dict.fromkeys(over, equal_step(pose.T_from_to, len(over)))
     typical = float(np.median([np.linalg.norm(T[:3, 3]) for T in known.values()]))
-    gap_steps = []
-    for step in loose:
-        length = max(float(np.linalg.norm(motion[step][:3, 3])), typical, _SIGMA_FLOOR)
-        sigmas = np.repeat(
-            [np.deg2rad(_ROTATION_SIGMA_DEG), _TRANSLATION_RELATIVE_SIGMA * length], 3
-        )
-        gap_steps.append(RelativePose(step, step + 1, motion[step], sigmas, INTERPOLATED_SOURCE))
     return replace(
         drive,
-        snippets=filled,
+        snippets=_filled(drive.snippets, _completed(raw, range(count - 1)), count, sources),
         trusted=trusted,
         motions=list(steps.values()),
         interpolated=dict(sorted(frames.items())),
-        gap_steps=gap_steps,
+        gap_steps=[_guess(k, motion[k], typical) for k in loose],
         views=[view for view in drive.views if view.index not in frames],
         keyframes=[keyframe for keyframe in drive.keyframes if keyframe.index not in frames],
     )
+
+
+def _is_trusted(snippet: SnippetPoses, frozen: Collection[int], cuts: Collection[int]) -> bool:
+    """Whether a snippet sees no frozen frame and does not measure across a cut."""
+    span = {snippet.target, *snippet.sources}
+    return span.isdisjoint(frozen) and not any(min(span) < cut <= max(span) for cut in cuts)
+
+
+def _guess(k: int, T_k_next: FloatArray, typical: float) -> RelativePose:
+    """An interpolated step, whose sigmas are wide: by its length, or by a ``typical`` one."""
+    length = max(float(np.linalg.norm(T_k_next[:3, 3])), typical, _SIGMA_FLOOR)
+    sigmas = np.repeat([np.deg2rad(_ROTATION_SIGMA_DEG), _TRANSLATION_RELATIVE_SIGMA * length], 3)
+    return RelativePose(k, k + 1, T_k_next, sigmas, INTERPOLATED_SOURCE)
 
 
 def _without_frozen(
@@ -144,13 +143,14 @@ def _completed(known: Mapping[int, FloatArray], steps: Collection[int]) -> dict[
     found = np.empty((len(unknown), 6))
     for row, step in enumerate(unknown):
         after = int(np.searchsorted(numbers, step))
-        around = (
-            slice(max(after - _STEPS_OF_A_MOTION, 0), after),
-            slice(after, after + _STEPS_OF_A_MOTION),
-        )
-        ends = [(numbers[part], motion[part].mean(axis=0)) for part in around if len(numbers[part])]
-        distances = np.array([np.abs(near - step).min() for near, _ in ends], np.float64)[::-1]
-        found[row] = distances @ np.array([mean for _, mean in ends]) / distances.sum()
+        before = slice(max(after - _STEPS_OF_A_MOTION, 0), after)
+        means, distances = [], []
+        for part in (before, slice(after, after + _STEPS_OF_A_MOTION)):
+            if len(numbers[part]):
+                means.append(motion[part].mean(axis=0))
+                distances.append(np.abs(numbers[part] - step).min())
+        weights = np.array(distances, np.float64)[::-1]  # of two, the nearer mean weighs more
+        found[row] = weights @ np.array(means) / weights.sum()
     T = from_rotation_vector(found[:, :3], found[:, 3:])
     return {**known, **dict(zip(unknown, T, strict=True))}
 

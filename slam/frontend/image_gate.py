@@ -32,9 +32,8 @@ _NOISE_CONTRAST = 0.3  # contrast after blurring over contrast before, below whi
 _STANDING_GREY, _MOVING_GREY = 0.7, 4.0
 _BRIGHT_GREY = 235.0  # the sky does not change where the camera sees white
 _STANDING_IMAGES, _REMEMBERED_IMAGES = 20, 50
-_REPEAT_DIFFERENCE = (
-    0.1  # largest difference of a re-encoded copy to its image, over the mean image gradient
-)
+# largest difference of a re-encoded copy to its image, over the mean image gradient
+_REPEAT_DIFFERENCE = 0.1
 
 Verdict = Literal["new", "repeated"] | Failed
 _Layer = NDArray[np.float32]

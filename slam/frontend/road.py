@@ -144,9 +144,9 @@ class RoadHomography:
                 strip, layer_before, layer_now, T_unit, plane, expected
             )
             plane = step.plane
-        standing = _correlation(
-            *(strip.local(fine[strip.rows, strip.columns, 0]) for _, fine in (before, now))
-        )
+        fine_before = strip.local(before[1][strip.rows, strip.columns, 0])
+        fine_now = strip.local(now[1][strip.rows, strip.columns, 0])
+        standing = _correlation(fine_before, fine_now)
         length = float(np.linalg.norm(plane))
         deviation = float(np.arccos(np.clip(plane / length @ expected, -1.0, 1.0)))
         if not np.isfinite(length) or deviation > np.deg2rad(_MAX_TILT_DEG):
@@ -183,7 +183,8 @@ class RoadHomography:
         x, y, z = np.moveaxis(points_previous, -2, 0)
         u = camera.fx * x / z + camera.cx
         v = camera.fy * y / z + camera.cy - self._top_row
-        columns, rows = (np.asarray(side, np.float32).reshape(-1, u.shape[-1]) for side in (u, v))
+        columns = np.asarray(u, np.float32).reshape(-1, u.shape[-1])
+        rows = np.asarray(v, np.float32).reshape(-1, u.shape[-1])
         return np.asarray(cv2.remap(layer, columns, rows, cv2.INTER_LINEAR)).reshape(*u.shape, 3)
 
     def _search(
@@ -193,12 +194,8 @@ class RoadHomography:
         rays, seen = strip.rays[:, ::3], now[strip.rows[::3], strip.columns[::3], 0]
         R, t, n = _single(T_unit[:3, :3], T_unit[:3, 3], normal)
         shift = np.outer(t, n @ rays)
-        difference = (
-            self._sampled(before, _ahead(R @ rays + _LENGTHS_HEIGHTS[:, None, None] * shift))[
-                ..., 0
-            ]
-            - seen
-        )
+        points = _ahead(R @ rays + _LENGTHS_HEIGHTS[:, None, None] * shift)
+        difference = self._sampled(before, points)[..., 0] - seen
         costs = np.minimum(np.abs(difference), _CLIPPED_GREY).mean(axis=1)
         return np.asarray(_LENGTHS_HEIGHTS[int(np.argmin(costs))] * normal)
 
@@ -260,11 +257,10 @@ def with_slope(road_steps: Mapping[Ends, RoadStep], steps: Steps) -> dict[Ends, 
     )
     noise = _OF_PATH * mad_sigma((own - around)[:, 1])
     share = 1.0 / (1.0 + (noise / np.deg2rad(_PITCH_SIGMA_DEG)) ** 2)
-    directions = zip(motions, usual + share * (around - usual), strict=True)
-    return {
-        **road_steps,
-        **{ends: road_steps[ends].along(direction) for ends, direction in directions},
-    }
+    sloped = dict(road_steps)
+    for ends, direction in zip(motions, usual + share * (around - usual), strict=True):
+        sloped[ends] = road_steps[ends].along(direction)
+    return sloped
 
 
 def _path_directions(steps: Steps, reach: float) -> dict[int, FloatArray]:
@@ -277,17 +273,20 @@ def _path_directions(steps: Steps, reach: float) -> dict[int, FloatArray]:
         run = list(consecutive)
         T = chain(np.array([steps[ends].relative_pose.T_from_to for ends in run]))
         places = path_distance(T)
-        behind, ahead = (
-            np.column_stack(
-                [np.interp(places + sign * reach, places, T[:, axis, 3]) for axis in range(3)]
-            )
-            for sign in (-1, 1)
-        )
+        behind = _interpolated(places - reach, places, T[:, :3, 3])
+        ahead = _interpolated(places + reach, places, T[:, :3, 3])
         chords = np.einsum("nba,nb->na", T[:, :3, :3], ahead - behind)
         seen_from = [run[0][0], *(last for _, last in run)]
-        known = zip(seen_from, chords, np.linalg.norm(chords, axis=1), strict=True)
-        found |= {frame: chord / length for frame, chord, length in known if length > reach}
+        lengths = np.linalg.norm(chords, axis=1)
+        for frame, chord, length in zip(seen_from, chords, lengths, strict=True):
+            if length > reach:
+                found[frame] = chord / length
     return found
+
+
+def _interpolated(at: FloatArray, places: FloatArray, centres: FloatArray) -> FloatArray:
+    """Centres ``(M, 3)`` at places ``(M,)`` along a path, of ``(N, 3)`` at places ``(N,)``."""
+    return np.column_stack([np.interp(at, places, axis) for axis in centres.T])
 
 
 @dataclass(frozen=True)

@@ -40,8 +40,11 @@ def smooth_rotations(steps: Steps, relative_rotations: Sequence[RelativeRotation
     """
     motions = triangulated(steps)
     by_start = shortest_by_start(motions)
-    paths = [(rotation, path_between(by_start, *rotation.ends)) for rotation in relative_rotations]
-    usable = [(rotation, path) for rotation, path in paths if path]
+    usable = []
+    for rotation in relative_rotations:
+        path = path_between(by_start, *rotation.ends)
+        if path:
+            usable.append((rotation, path))
     if not usable:
         return steps
     T_current_previous = invert(
@@ -70,11 +73,11 @@ def smooth_rotations(steps: Steps, relative_rotations: Sequence[RelativeRotation
     lengths = np.linalg.norm(directions, axis=1, keepdims=True)
     turned = directions + lengths * moves[:, :, 0]
     T_current_previous[:, :3, 3] = turned * lengths / np.linalg.norm(turned, axis=1, keepdims=True)
-    smoothed = {
-        ends: replace(motion, relative_pose=replace(motion.relative_pose, T_from_to=T))
-        for (ends, motion), T in zip(motions.items(), invert(T_current_previous), strict=True)
-    }
-    return {**steps, **smoothed}
+    smoothed = dict(steps)
+    for motion, T in zip(motions.values(), invert(T_current_previous), strict=True):
+        pose = replace(motion.relative_pose, T_from_to=T)
+        smoothed[motion.ends] = replace(motion, relative_pose=pose)
+    return smoothed
 
 
 def _equations(

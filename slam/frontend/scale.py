@@ -58,9 +58,8 @@ _ACCELERATION_SIGMA = 3.0  # of a vehicle, in camera heights: 5 m/s2 at 1.65 m
 _SPEED_STEPS = 11  # window over which the speed is averaged that a change is compared with
 _LENGTH_SIGMA = 0.05  # of a single length where it is compared with the one before
 _CONTRADICTION_SIGMAS = 5.0
-_CORRELATED_WIDENING = (
-    1.5  # factor on the sigmas in the pose graph, for errors correlated along the road
-)
+# factor on the sigmas in the pose graph, for errors correlated along the road
+_CORRELATED_WIDENING = 1.5
 
 
 @dataclass(frozen=True)

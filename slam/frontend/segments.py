@@ -21,12 +21,15 @@ def find_cuts(
         doubtful: frames that are unusable or repeat the one before.
     """
     ends = set(measured)
-    longer = [(a, b) for a, b in ends if b - a > 1]
+    crossed: set[int] = set()  # frames across whose beginning a longer step measures
+    for first, last in ends:
+        if last - first > 1:
+            crossed.update(range(first + 1, last + 1))
     cuts = []
     for first, last, _ in failures:
         around = {first - 1, first, last, last + 1}
         alone = last == first + 1 and (first - 1, first) in ends and (last, last + 1) in ends
-        if alone and around.isdisjoint(doubtful) and not any(a < last <= b for a, b in longer):
+        if alone and around.isdisjoint(doubtful) and last not in crossed:
             cuts.append(last)
     return sorted(set(cuts))
 

@@ -29,7 +29,16 @@ _TILES = 3, 4  # down and across: corners are spread over them
 _NEAREST = 1e-6
 _INVERSIONS = 2
 _DEPTH_WIDTH_PX = 400
+MAX_CORNERS = 800  # of a step: twice as many change no error and take twice the time
 _GRID_PX = 3  # the flow is computed at every third pixel: learned depth has no finer detail
+# displacements that remain after the predicted flow are small
+_PREDICTED_LEVELS = 2
+_ACROSS_PX = 1.0  # largest error of a corner over several steps, by the way across and step by step
+# steps between frames whose rotation is also measured directly: halves its error
+ROTATION_BASELINE = 2
+# tracks below which they are sought again, with the wide window and equal exposure
+FEW_CORNERS = 60
+_WIDE_WINDOW_PX = 31  # side of the window after most tracks were lost, pixels
 
 
 class Search(NamedTuple):
@@ -64,19 +73,8 @@ STEP_SEARCH = Search(side=11, levels=4, limits=(30, 0.01), back=None, error_px=0
 KEYFRAME_SEARCH = Search(
     side=16, levels=3, limits=(15, 0.02), back=(1, (10, 0.05)), error_px=0.7, norm=2
 )
-MAX_CORNERS = 800  # of a step: twice as many change no error and take twice the time
 STEP_CORNERS = Texture(quality=0.008, spacing_px=11.0, block_px=5)
 KEYFRAME_CORNERS = Texture(quality=0.0003, spacing_px=12.0, block_px=3)
-# displacements that remain after the predicted flow are small
-_PREDICTED_LEVELS = 2
-_ACROSS_PX = 1.0  # largest error of a corner over several steps, by the way across and step by step
-ROTATION_BASELINE = (
-    2  # steps between frames whose rotation is also measured directly: halves its error
-)
-FEW_CORNERS = (
-    60  # tracks below which they are sought again, with the wide window and equal exposure
-)
-_WIDE_WINDOW_PX = 31  # side of the window after most tracks were lost, pixels
 
 
 def track(

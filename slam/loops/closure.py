@@ -34,9 +34,8 @@ _SAME_PLACE = 0.05  # of the least path of a loop: 0.75 m
 _BLOCK = 256
 Apart = Callable[[NDArray[np.intp]], NDArray[np.bool_]]
 _SUPPORT_SIGMAS = 3.0  # largest difference of supporting loops, sigmas
-_SUPPORT_DRIFT_RATIO = (
-    0.1  # drift of the odometry between supporting loops over the path between them
-)
+# drift of the odometry between supporting loops over the path between them
+_SUPPORT_DRIFT_RATIO = 0.1
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,8 @@ _ARRAYS = ("camera", "frames", "counts", "T_world_camera", "pixels", "descriptor
 _NEIGHBOURS = 4  # places on either side that a place is matched with
 _LEAST_SIGHTINGS = 3
 _LEAST_ANGLE = np.deg2rad(1.0)  # between two rays of a point
-_LARGEST_DEPTH_ERROR = (
-    0.2  # of learned depth, median: on streets it is 0.06 to 0.12, in a kitchen 0.4
-)
+# of learned depth, median: on streets it is 0.06 to 0.12, in a kitchen 0.4
+_LARGEST_DEPTH_ERROR = 0.2
 
 Rows = NDArray[np.intp]
 

@@ -31,25 +31,21 @@ from slam.geometry.se3 import FloatArray, apply, chain, invert
 
 _PIXEL_SIGMA = 0.5  # of a sighting, pixels
 _POINT_SIGMA = 0.005  # least relative sigma of the depth of a point
-_INDEPENDENT = (
-    10  # points with independent errors that those of a keyframe are worth: all share its pose
-)
+# points with independent errors that those of a keyframe are worth: all share its pose
+_INDEPENDENT = 10
 # sigmas of the logarithm of the unit: to the keyframe from which on points have parallax, and between two of one part
 _BEGUN, _CARRIED = 0.03, 0.05
-_TURNED, _UNKNOWN = (
-    0.05,
-    0.5,
-)  # the most by points without parallax, and where keyframes share few points
+# the most by points without parallax, and where keyframes share few points
+_TURNED = 0.05
+_UNKNOWN = 0.5
 _DRIFT = 0.2  # of the sigma of one carry, that adds up along a map: what one keyframe lacks, the next ones see
 _LEAST_KEYFRAMES = 4  # of a part
-_IMAGE_ROTATION, _IMAGE_LENGTH = (
-    np.deg2rad(0.5),
-    0.03,
-)  # sigmas of a turn of the whole image, radians and depths
-_ROTATION, _LENGTH = (
-    np.deg2rad(0.1),
-    0.01,
-)  # least sigmas by points without parallax, radians and depths
+# sigmas of a turn of the whole image, radians and depths
+_IMAGE_ROTATION = np.deg2rad(0.5)
+_IMAGE_LENGTH = 0.03
+# least sigmas by points without parallax, radians and depths
+_ROTATION = np.deg2rad(0.1)
+_LENGTH = 0.01
 _DEPTH_SIGMA = 0.2  # of a length by learned depth, over it
 logger = logging.getLogger(__name__)
 

@@ -70,9 +70,8 @@ _LEARNED_LENGTH_RELATIVE_SIGMA = 0.05
 # least rotation sigma of a standing camera and of PnP
 _LEAST_ROTATION_SIGMA = np.deg2rad(0.01)
 _REPROJECTION_PX = 2.0  # largest reprojection error of a PnP inlier, pixels
-_ROAD_TOLERANCE = (
-    0.2  # largest deviation of a corner on the road from the camera's height, in camera heights
-)
+# largest deviation of a corner on the road from the camera's height, in camera heights
+_ROAD_TOLERANCE = 0.2
 _STILL_FLOW_PX = 0.3  # median optical flow below which the camera stands still, pixels
 _MOST_STILL_FLOW_PX = 1.0  # of a corner of the world before a camera that stands still, pixels
 _MIN_PARALLAX_PX = 0.8  # least median optical flow that remains after rotation is removed, pixels

@@ -38,9 +38,8 @@ _USUAL_SIGMA = 0.15
 _USUAL_FAR_SIGMA = 0.25
 _FOCAL_STEP = 0.01  # of the logarithm, for its derivative
 _LEAST_SIGMA_PX = 1e-3
-_CORRELATION = (
-    4.0  # of the errors of corners, and of those that flow makes where a camera hardly turns
-)
+# of the errors of corners, and of those that flow makes where a camera hardly turns
+_CORRELATION = 4.0
 
 
 @dataclass(frozen=True, eq=False)

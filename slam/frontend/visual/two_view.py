@@ -63,9 +63,8 @@ _HATS = np.array(
 )
 _CELL_PX = 8.0
 _SPREAD_CELLS = 1.5
-_SHARPNESS = (
-    4.0  # power of a cell's inlier ratio over that of the whole image, by which corners weigh
-)
+# power of a cell's inlier ratio over that of the whole image, by which corners weigh
+_SHARPNESS = 4.0
 # decay a step: a half-life of seven steps
 _KEPT = 0.9
 # weight, in corners, of the prior that a cell has the inlier ratio of the whole image

@@ -17,6 +17,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ from scipy.linalg import solveh_banded
 from slam.config.sections import ScaleConfig, ScaleMode
 from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
+from slam.frontend.road import RoadStep
 from slam.frontend.visual.motion import Motion, links, triangulated
 from slam.geometry.robust import mad_sigma, running_median
 from slam.geometry.se3 import FloatArray
@@ -34,9 +36,8 @@ from slam.runtime.errors import Failed, SlamError
 LengthUnit = Literal["metres", "camera heights", "no metric unit", "the networks' own unit"]
 
 logger = logging.getLogger(__name__)
-_LEAST_ROAD = (
-    1 / 3
-)  # of the frames, half of which have learned depth; fewer see a floor or a table now and then
+# of the frames, half of which have learned depth; fewer see a floor or a table now and then
+_LEAST_ROAD = 1 / 3
 _MAX_CONTRADICTION = 2.5  # largest factor between a measured length and that by learned depth
 _REFERENCE_FRAMES = 50  # number of first frames that mode reference compares
 _REJECTION_SIGMAS = 3.0  # distance from the median beyond which a frame is left out
@@ -135,34 +136,15 @@ def find_scale(
 
     Without a road in most frames, the planes that were found give no unit that means anything.
     """
-    motions, frames = triangulated(drive.steps), len(drive)
-    metres = _lengths(lidar_steps)
+    motions = triangulated(drive.steps)
+    frames = len(drive)
     height = camera_height_m if mode == "camera-height" else None
     if mode == "lidar":
         height = height_by_lidar(lidar_steps, drive) or camera_height_m
     unit = 1.0 if height is None else height
-    absolute = {
-        ends: (unit * road.length_heights, road.relative_sigma)
-        for ends, road in drive.road_steps.items()
-    }
-    if mode == "lidar":
-        sigmas = {pose.ends: float(pose.sigmas[3]) for pose in lidar_steps}
-        absolute |= {
-            ends: (length, sigmas[ends] / length) for ends, length in metres.items() if length > 0
-        }
+    absolute = _absolute_lengths(drive.road_steps, unit, lidar_steps if mode == "lidar" else ())
     by_planes = scale_from_road(drive.roads, unit)
-    if isinstance(by_planes, Failed):
-        ratios = [
-            absolute[ends][0] / motion.length_unscaled
-            for ends, motion in motions.items()
-            if ends in absolute
-        ]
-        prior_unit = np.full(frames, float(np.median(ratios)) if ratios else 1.0)
-    elif absolute:
-        # steps of known length measure the drift of the unit; rain or a car ahead biases the learned ground plane
-        prior_unit = np.full(frames, by_planes.value)
-    else:
-        prior_unit = scale_track(drive.roads, unit, by_planes)
+    prior_unit = _prior_unit(drive.roads, motions, absolute, by_planes, unit)
     steps = links(motions, frames)
     evidence = gather_evidence(steps, motions, absolute, prior_unit, unit)
     if not isinstance(by_planes, Failed):
@@ -176,7 +158,7 @@ def find_scale(
     misfit = np.abs(evidence.absolute - np.log(solved.length))
     used = int(np.isfinite(misfit).sum())
     estimate = by_planes
-    is_metric = height is not None or (mode == "lidar" and len(metres) > 0)
+    is_metric = height is not None or (mode == "lidar" and len(lidar_steps) > 0)
     named: LengthUnit = "metres" if is_metric else "camera heights"
     if used >= MIN_FRAMES:
         spread = mad_sigma(misfit[np.isfinite(misfit)])
@@ -188,12 +170,57 @@ def find_scale(
     with_road = max(used, 0 if isinstance(by_planes, Failed) else by_planes.frames_used)
     if named == "camera heights" and with_road < _LEAST_ROAD * frames:
         named = "no metric unit"
-    contradicted = [ends for ends, is_so in zip(steps, solved.contradicted, strict=True) if is_so]
-    rows = zip(
-        steps, solved.length, solved.relative_sigma, solved.relative_correlated_sigma, strict=True
-    )
-    lengths = {ends: StepLength(*map(float, row)) for ends, *row in rows if np.isfinite(row[0])}
+    lengths = _solved_lengths(steps, solved)
+    contradicted = list(compress(steps, solved.contradicted))
     return Scale(mode, estimate, per_frame, lengths, named, contradicted)
+
+
+def _absolute_lengths(
+    road_steps: Mapping[Ends, RoadStep], unit: float, lidar_steps: Sequence[RelativePose]
+) -> dict[Ends, tuple[float, float]]:
+    """Lengths by the road, in ``unit`` a camera height, or by LiDAR, and their relative sigmas."""
+    absolute = {}
+    for ends, road in road_steps.items():
+        absolute[ends] = unit * road.length_heights, road.relative_sigma
+    for pose in lidar_steps:
+        length = float(np.linalg.norm(pose.T_from_to[:3, 3]))
+        if length > 0:
+            absolute[pose.ends] = length, float(pose.sigmas[3]) / length
+    return absolute
+
+
+def _prior_unit(
+    roads: Sequence[float | Failed],
+    motions: Mapping[Ends, Motion],
+    absolute: Mapping[Ends, tuple[float, float]],
+    by_planes: ScaleEstimate | Failed,
+    camera_height: float,
+) -> FloatArray:
+    """The mode's unit per unscaled length near each frame ``(N,)``, before lengths are solved."""
+    if isinstance(by_planes, Failed):
+        ratios = []
+        for ends, motion in motions.items():
+            if ends in absolute:
+                ratios.append(absolute[ends][0] / motion.length_unscaled)
+        return np.full(len(roads), float(np.median(ratios)) if ratios else 1.0)
+    if absolute:
+        # steps of known length measure the drift of the unit; rain or a car ahead biases the
+        # learned ground plane
+        return np.full(len(roads), by_planes.value)
+    return scale_track(roads, camera_height, by_planes)
+
+
+def _solved_lengths(steps: Sequence[Ends], solved: StepLengths) -> dict[Ends, StepLength]:
+    """The lengths that were measured."""
+    lengths = {}
+    for row, ends in enumerate(steps):
+        if np.isfinite(solved.length[row]):
+            lengths[ends] = StepLength(
+                float(solved.length[row]),
+                float(solved.relative_sigma[row]),
+                float(solved.relative_correlated_sigma[row]),
+            )
+    return lengths
 
 
 def _lengths(steps: Sequence[RelativePose]) -> dict[Ends, float]:
@@ -206,11 +233,12 @@ def height_by_lidar(lidar_steps: Sequence[RelativePose], drive: Drive) -> float 
     roads = drive.road_steps
     heights = [metres[ends] / roads[ends].length_heights for ends in roads if ends in metres]
     if not heights:
-        heights = [
-            metres[ends] / motion.length_unscaled * height
-            for ends, motion in triangulated(drive.steps).items()
-            if ends in metres and not isinstance(height := drive.roads[ends[0]], Failed)
-        ]
+        for ends, motion in triangulated(drive.steps).items():
+            if ends not in metres:
+                continue
+            plane = drive.roads[ends[0]]
+            if not isinstance(plane, Failed):
+                heights.append(metres[ends] / motion.length_unscaled * plane)
     return float(np.median(heights)) if heights else None
 
 
@@ -244,16 +272,19 @@ def scale_from_reference(
     T_world_camera_unscaled: FloatArray, T_world_camera_true: FloatArray
 ) -> ScaleEstimate | Failed:
     """True path length over estimated path length of the first 50 frames."""
-    estimated, true = (
-        np.linalg.norm(np.diff(T[:_REFERENCE_FRAMES, :3, 3], axis=0), axis=1)
-        for T in (T_world_camera_unscaled, T_world_camera_true)
-    )
+    estimated = _step_lengths(T_world_camera_unscaled[:_REFERENCE_FRAMES])
+    true = _step_lengths(T_world_camera_true[:_REFERENCE_FRAMES])
     if estimated.sum() <= 0 or true.sum() <= 0:
         return Failed(f"the camera does not move within the first {_REFERENCE_FRAMES} frames")
     value = float(true.sum() / estimated.sum())
     moving = estimated > 0.1 * estimated.mean()
     spread = float(np.std(true[moving] / estimated[moving] / value))
     return ScaleEstimate(value, spread, len(estimated) + 1)
+
+
+def _step_lengths(T_world_camera: FloatArray) -> FloatArray:
+    """Lengths ``(N - 1,)`` of the steps of a path ``(N, 4, 4)``."""
+    return np.asarray(np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1))
 
 
 def known_frames(config: ScaleConfig, stamps: FloatArray) -> tuple[int, int]:
@@ -268,10 +299,8 @@ def known_frames(config: ScaleConfig, stamps: FloatArray) -> tuple[int, int]:
             index, inside = end, end < len(stamps)
         else:
             stamp = float(end.removesuffix("s"))
-            index, inside = (
-                int(np.abs(stamps - stamp).argmin()),
-                bool(stamps[0] <= stamp <= stamps[-1]),
-            )
+            index = int(np.abs(stamps - stamp).argmin())
+            inside = bool(stamps[0] <= stamp <= stamps[-1])
         if not inside:
             raise SlamError(
                 f"scale.known_between names {end}, but the drive has frames 0 to {len(stamps) - 1} "

@@ -28,10 +28,12 @@ def learned_units(local: LocalMap, carried: FloatArray) -> tuple[FloatArray, Flo
 
     The logarithm of the unit is a random walk with sigmas ``carried`` ``(K - 1,)`` from each keyframe to the next.
     """
-    known = [ratios[ratios > 0.0] for ratios in map(local.ratios, local.keyframes)]
-    own = np.array(
-        [-float(np.median(np.log(r))) if len(r) >= _LEAST_DEPTHS else np.nan for r in known]
-    )
+    own = np.full(len(local.keyframes), np.nan)
+    for row, keyframe in enumerate(local.keyframes):
+        ratios = local.ratios(keyframe)
+        known = ratios[ratios > 0.0]
+        if len(known) >= _LEAST_DEPTHS:
+            own[row] = -float(np.median(np.log(known)))
     if not np.isfinite(own).any():
         return np.ones(len(own)), np.ones(len(own))
     # the scatter of the units of learned depth about that of the map, by keyframes that share no error

@@ -186,11 +186,12 @@ class LocalMap:
 
     def views(self, points: FloatArray) -> list[View]:
         """Corners of all keyframes with their points in the camera, of ``points`` ``(N, 3)`` in the world by track."""
-        in_cameras = (
-            apply(k.T_camera_world, points[k.track_ids]).astype(np.float32) for k in self.keyframes
-        )
-        pairs = zip(self.keyframes, in_cameras, strict=True)
-        return [View(k.index, k.pixels.astype(np.float32), k.descriptors, own) for k, own in pairs]
+        views = []
+        for keyframe in self.keyframes:
+            seen = apply(keyframe.T_camera_world, points[keyframe.track_ids]).astype(np.float32)
+            pixels = keyframe.pixels.astype(np.float32)
+            views.append(View(keyframe.index, pixels, keyframe.descriptors, seen))
+        return views
 
     def parallax(self, keyframes: Sequence[TrackedKeyframe]) -> Parallax:
         """Of all points, between those of the keyframes that see them."""
@@ -229,12 +230,12 @@ class LocalMap:
         seen[np.concatenate([keyframe.track_ids for keyframe in self.keyframes[first:]])] = True
         seen &= np.isfinite(self.points[:, 0])
         # older keyframes that share most of these points
-        shared = [
-            (int(seen[keyframe.track_ids].sum()), k)
-            for k, keyframe in enumerate(self.keyframes[:first])
-        ]
-        best = sorted((pair for pair in shared if pair[0] >= _SHARED), reverse=True)[:_ADJUSTED]
-        fixed = sorted(k for _, k in best)
+        shared = []
+        for k, keyframe in enumerate(self.keyframes[:first]):
+            points = int(seen[keyframe.track_ids].sum())
+            if points >= _SHARED:
+                shared.append((points, k))
+        fixed = sorted(k for _, k in sorted(shared, reverse=True)[:_ADJUSTED])
         chosen = [*fixed, *range(first, len(self.keyframes))]
         sightings, track_ids = self.sightings(chosen, seen, intrinsics)
         limits = _YOUNG_LIMITS if len(self.keyframes) <= _YOUNG else _LIMITS

@@ -105,7 +105,8 @@ def keyframe_poses(
     for number, segment in enumerate(maps):
         located = _segment_poses(segment, intrinsics, seed)
         poses += located
-        segments |= dict.fromkeys((frame for pose in located for frame in pose.ends), number)
+        for pose in located:
+            segments[pose.from_index] = segments[pose.to_index] = number
         turns += [turn.scaled(1.0 / learned[number]) for turn in segment.turns]
         closing |= _loop_poses(segment, loops, intrinsics, seed)
     outside = [

@@ -37,7 +37,8 @@ class GroundPlaneFitter:
         self._seed = seed
         # rows, columns (P,) and rays (P, 3) of about so many pixels; the horizon is taken at cy (a level camera)
         horizon, bottom = intrinsics.cy, intrinsics.height - 1.0
-        top_row, bottom_row = (horizon + share * (bottom - horizon) for share in _ROAD_ROWS)
+        top_row = horizon + _ROAD_ROWS[0] * (bottom - horizon)
+        bottom_row = horizon + _ROAD_ROWS[1] * (bottom - horizon)
         area = (
             intrinsics.width * (bottom_row - top_row) * (_ROAD_TOP_WIDTH + _ROAD_BOTTOM_WIDTH) / 2
         )
@@ -94,9 +95,8 @@ def _ransac(rays: FloatArray, inverse_depth: FloatArray, seed: int) -> FloatArra
     solvable = np.abs(np.linalg.det(minimal)) > 1e-6
     if not solvable.any():
         return None
-    planes = np.linalg.solve(minimal[solvable], inverse_depth[samples[solvable]][..., None])[
-        ..., 0
-    ]  # (S, 3)
+    right = inverse_depth[samples[solvable]][..., None]
+    planes = np.linalg.solve(minimal[solvable], right)[..., 0]  # (S, 3)
     level = planes[:, 1] > np.cos(np.deg2rad(_MAX_TILT_DEG)) * np.linalg.norm(planes, axis=1)
     if not level.any():
         return None

@@ -53,14 +53,14 @@ class LoopClosures:
 
     def without(self, dropped: Sequence[RelativePose]) -> LoopClosures:
         """The same after the pose graph dropped some accepted loops."""
-        ends = {(edge.from_index, edge.to_index) for edge in dropped}
-        gone = tuple(
-            loop.refused("contradicts the pose graph")
-            for loop in self.accepted
-            if loop.ends in ends
-        )
-        kept = tuple(loop for loop in self.accepted if loop.ends not in ends)
-        return replace(self, accepted=kept, rejected=gone + self.rejected)
+        ends = {edge.ends for edge in dropped}
+        kept, gone = [], []
+        for loop in self.accepted:
+            if loop.ends in ends:
+                gone.append(loop.refused("contradicts the pose graph"))
+            else:
+                kept.append(loop)
+        return replace(self, accepted=tuple(kept), rejected=(*gone, *self.rejected))
 
     def details(self) -> dict[str, Any]:
         """For ``loops.json``: every accepted loop with its measurement, and the rejected ones with most inliers."""
@@ -110,7 +110,7 @@ def close_loops(
     if not config.enabled:
         return LoopClosures(not_sought="loop closure is switched off (loops.enabled)")
     track, least = Track.of_drive(T_world_camera), _least_path(views, is_metric)
-    frames = np.array([view.index for view in views], dtype=np.intp)
+    frames = _frames(views)
 
     def apart(rows: NDArray[np.intp]) -> NDArray[np.bool_]:
         is_later = frames[rows, None] - frames >= _LEAST_GAP_FRAMES
@@ -142,9 +142,15 @@ def find_loops(
     tried += verdicts(
         c for c in candidates if c.rank >= _TRIED_FIRST and views[c.later].index in seen_again
     )
-    verified = [verdict for verdict in tried if isinstance(verdict, Loop)]
+    verified: list[Loop] = []
+    refused: list[RejectedLoop] = []
+    for verdict in tried:
+        if isinstance(verdict, Loop):
+            verified.append(verdict)
+        else:
+            refused.append(verdict)
     accepted, rejected = agreeing(verified, track, verifier.thresholds)
-    rejected += [verdict for verdict in tried if isinstance(verdict, RejectedLoop)]
+    rejected += refused
     logger.info(
         "loops: %d candidates, %d verified, %d accepted", len(tried), len(verified), len(accepted)
     )
@@ -156,6 +162,10 @@ def most_inliers_first(loops: Iterable[RejectedLoop]) -> tuple[RejectedLoop, ...
     return tuple(
         sorted(loops, key=lambda loop: (-loop.inliers, -loop.score, loop.to_index, loop.from_index))
     )
+
+
+def _frames(views: Sequence[View]) -> NDArray[np.intp]:
+    return np.array([view.index for view in views], dtype=np.intp)
 
 
 def _least_path(views: Sequence[View], is_metric: bool) -> float:
@@ -178,13 +188,11 @@ def _counted_once(loops: Sequence[Loop], path: FloatArray, near: float) -> list[
     """
     ends = path[np.array([loop.ends for loop in loops], int).reshape(-1, 2)]
     alike = (np.abs(ends[:, None] - ends) < near).all(axis=2).sum(axis=1)
-    return [
-        replace(
-            loop,
-            measured=replace(loop.measured, sigmas=float(np.sqrt(count)) * loop.measured.sigmas),
-        )
-        for loop, count in zip(loops, alike, strict=True)
-    ]
+    widened = []
+    for loop, count in zip(loops, alike, strict=True):
+        sigmas = float(np.sqrt(count)) * loop.measured.sigmas
+        widened.append(replace(loop, measured=replace(loop.measured, sigmas=sigmas)))
+    return widened
 
 
 class Candidate(NamedTuple):
@@ -209,7 +217,8 @@ def find_candidates(
     if len(views) < 2 or not any(map(len, views)):
         return []
     weighted = PlaceIndex(views).weights
-    indices, rows = np.array([view.index for view in views]), np.arange(len(views))
+    indices = _frames(views)
+    rows = np.arange(len(views))
     neighbour = np.asarray((weighted[1:] * weighted[:-1]).sum(axis=1)).ravel()
     expected = np.maximum(np.concatenate([neighbour[:1], neighbour]), 1e-3)
     candidates = []
@@ -218,8 +227,8 @@ def find_candidates(
         scores = (weighted[block] @ weighted.T).toarray() / expected[block, None]  # (block, V)
         scores[~apart(block) | (rows >= block[:, None])] = 0.0
         for later, row in zip(block, scores, strict=True):
-            peaks = enumerate(_peaks(row, indices, thresholds))
-            candidates += [Candidate(k, int(later), float(row[k]), rank) for rank, k in peaks]
+            for rank, k in enumerate(_peaks(row, indices, thresholds)):
+                candidates.append(Candidate(k, int(later), float(row[k]), rank))
     return candidates
 
 
@@ -342,13 +351,12 @@ def _votes(
         rotation = rotation_angle(cycle[:, :3, :3])
         translation = np.linalg.norm(cycle[:, :3, 3], axis=1)
         both = np.hypot(sigmas[near], sigmas[k])
-        length = np.linalg.norm(T_earlier[:, :3, 3], axis=1) + np.linalg.norm(
-            T_later[:, :3, 3], axis=1
-        )
+        length_earlier = np.linalg.norm(T_earlier[:, :3, 3], axis=1)
+        length = length_earlier + np.linalg.norm(T_later[:, :3, 3], axis=1)
         drift = np.deg2rad(thresholds.support_drift_deg) * distance[near].sum(axis=1)
         agrees = rotation < _SUPPORT_SIGMAS * both[:, 0] + drift
         agrees &= translation < _SUPPORT_SIGMAS * both[:, 3] + _SUPPORT_DRIFT_RATIO * length
-        votes.append(
-            (len(np.unique(ends[near[agrees], 1])), len(np.unique(ends[near[~agrees], 1])))
-        )
+        supporting = np.unique(ends[near[agrees], 1])
+        conflicting = np.unique(ends[near[~agrees], 1])
+        votes.append((len(supporting), len(conflicting)))
     return votes

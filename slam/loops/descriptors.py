@@ -31,12 +31,10 @@ def describe(grey: Grey, pixels: NDArray[np.floating[Any]]) -> Descriptors:
         return np.zeros((0, 32), np.uint8)
     # at half the size a quarter of the pixels describe the same surroundings
     half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    corners = [
-        cv2.KeyPoint(
-            0.5 * float(u) - 0.25, 0.5 * float(v) - 0.25, _SIFT_SIZE_PX / 2, float(angle), 1.0, 0, 0
-        )
-        for (u, v), angle in zip(pixels, _directions_deg(grey, pixels), strict=True)
-    ]
+    corners = []
+    for (u, v), angle in zip(pixels, _directions_deg(grey, pixels), strict=True):
+        x, y = 0.5 * float(u) - 0.25, 0.5 * float(v) - 0.25
+        corners.append(cv2.KeyPoint(x, y, _SIFT_SIZE_PX / 2, float(angle), 1.0, 0, 0))
     _, values = cv2.SIFT.create().compute(half, corners)
     roots = np.sqrt(values / np.maximum(values.sum(axis=1, keepdims=True), 1e-9))
     return np.packbits(np.concatenate([roots > _LOW, roots > _HIGH], axis=1), axis=1)
@@ -44,9 +42,8 @@ def describe(grey: Grey, pixels: NDArray[np.floating[Any]]) -> Descriptors:
 
 def hamming(first: Descriptors, second: Descriptors) -> NDArray[np.float32]:
     """Differing bits ``(M, N)`` of every pair of descriptors ``(M, 32)`` and ``(N, 32)``."""
-    words_first, words_second = (
-        np.ascontiguousarray(d).view(np.uint64).T for d in (first, second)
-    )  # (4, M), (4, N)
+    words_first = np.ascontiguousarray(first).view(np.uint64).T  # (4, M)
+    words_second = np.ascontiguousarray(second).view(np.uint64).T  # (4, N)
     differing = np.zeros((len(first), len(second)), np.uint16)
     for a, b in zip(words_first, words_second, strict=True):
         differing += np.bitwise_count(a[:, None] ^ b)

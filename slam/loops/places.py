@@ -86,14 +86,14 @@ class Places:
             raise RunError(f"{path} has format {version}, this version reads {_FORMAT}: run again")
         width, height, *pinhole = content["camera"].tolist()
         frames, ends = content["frames"].tolist(), np.cumsum(content["counts"])
-        # the part after the last view is empty
-        parts = [
-            np.split(content[name], ends)[: len(frames)]
-            for name in ("pixels", "descriptors", "points")
-        ]
-        views = tuple(View(index, *arrays) for index, *arrays in zip(frames, *parts, strict=True))
+        pixels = np.split(content["pixels"], ends)
+        descriptors = np.split(content["descriptors"], ends)
+        points = np.split(content["points"], ends)
+        views = []
+        for k, frame in enumerate(frames):  # the part after the last view is empty
+            views.append(View(frame, pixels[k], descriptors[k], points[k]))
         camera = Intrinsics(int(width), int(height), *pinhole, undistorted=undistorted)
-        return cls(camera, views, content["T_world_camera"])
+        return cls(camera, tuple(views), content["T_world_camera"])
 
 
 @dataclass(frozen=True)
@@ -150,13 +150,13 @@ class PlaceStructure:
     def tracks(self) -> Tracks:
         """Corners of all places joined to points that three or more of them see."""
         first = self._first
-        around = [self._around(row) for row in range(len(self._places.views))]
-        known = [np.isfinite(nearby.points[nearby.point, 0]) for nearby in around]
-        ends = [
-            (first[row] + nearby.point[kept], first[nearby.views[kept]] + nearby.corners[kept])
-            for row, (nearby, kept) in enumerate(zip(around, known, strict=True))
-        ]
-        one, other = (np.concatenate(side) for side in zip(*ends, strict=True))
+        of_places, of_neighbours = [], []
+        for row in range(len(self._places.views)):
+            nearby = self._around(row)
+            known = np.isfinite(nearby.points[nearby.point, 0])
+            of_places.append(first[row] + nearby.point[known])
+            of_neighbours.append(first[nearby.views[known]] + nearby.corners[known])
+        one, other = np.concatenate(of_places), np.concatenate(of_neighbours)
         joined = csr_array((np.ones(len(one)), (one, other)), (first[-1], first[-1]))
         _, track = connected_components(joined, directed=False)
         views = np.repeat(np.arange(len(self._places.views)), np.diff(first))
@@ -168,19 +168,18 @@ class PlaceStructure:
 
     def _triangulated_around(self, row: int) -> Tracks:
         """A point for each corner of a place, by the places around it."""
-        place, pairings = self._places.views[row], []
-        for other in range(
-            max(0, row - _NEIGHBOURS), min(len(self._places.views), row + _NEIGHBOURS + 1)
-        ):
-            rows = np.arange(len(place))
-            pairs = (
-                (rows, rows)
-                if other == row
-                else matches(place, self._places.views[other], self._thresholds)
-            )
-            pairings.append((np.full(len(pairs[0]), other), *pairs))
-        views, corners, seen = (np.concatenate(column) for column in zip(*pairings, strict=True))
-        return self._triangulated(views, seen, corners, len(place))
+        places = self._places.views
+        views, corners, points = [], [], []
+        for other in range(max(0, row - _NEIGHBOURS), min(len(places), row + _NEIGHBOURS + 1)):
+            point = corner = np.arange(len(places[row]))
+            if other != row:
+                point, corner = matches(places[row], places[other], self._thresholds)
+            views.append(np.full(len(corner), other))
+            corners.append(corner)
+            points.append(point)
+        return self._triangulated(
+            np.concatenate(views), np.concatenate(corners), np.concatenate(points), len(places[row])
+        )
 
     def _triangulated(self, views: Rows, corners: Rows, point: Rows, count: int) -> Tracks:
         """Points ``(count, 3)``, NaN where unknown, and the sightings that agree with them.

@@ -166,19 +166,13 @@ class LoopVerifier:
             reason = f"both directions differ by {rotation_deg:.1f} degrees and {translation_ratio:.0%} of the depth"
             return refused(reason, inliers)
         T_forward = invert(forward.T_camera_points)
-        half = Rotation.from_rotvec(
-            0.5 * Rotation.from_matrix(T_forward[:3, :3].T @ T_again[:3, :3]).as_rotvec()
-        )
+        apart = Rotation.from_matrix(T_forward[:3, :3].T @ T_again[:3, :3])
+        half = Rotation.from_rotvec(0.5 * apart.as_rotvec())
         T_middle = make(
             T_forward[:3, :3] @ half.as_matrix(), 0.5 * (T_forward[:3, 3] + T_again[:3, 3])
         )
-        sigmas = self._sigmas(
-            T_middle,
-            depth,
-            difference,
-            forward.sigmas,
-            backward.sigmas * np.repeat([1.0, scale], 3),
-        )
+        again = backward.sigmas * np.repeat([1.0, scale], 3)
+        sigmas = self._sigmas(T_middle, depth, difference, forward.sigmas, again)
         measured = RelativePose(earlier.index, later.index, T_middle, sigmas, LOOP_SOURCE)
         shared = np.union1d(forward.inliers, backward.inliers)
         corners = np.column_stack([rows_earlier[shared], rows_later[shared]])
@@ -189,32 +183,24 @@ class LoopVerifier:
         """The camera that sees points ``(M, 3)``, NaN where unknown, at pixels ``(M, 2)``; or why not."""
         thresholds, K = self.thresholds, self._intrinsics.K
         known = np.flatnonzero(np.isfinite(points).all(axis=1))
-        points_known, pixels_known = (
-            points[known].astype(np.float64),
-            pixels[known].astype(np.float64),
-        )
+        points_known = points[known].astype(np.float64)
+        pixels_known = pixels[known].astype(np.float64)
         if len(known) < thresholds.min_inliers:
             return f"only {len(known)} matches have a trusted depth"
-        tolerance, iterations = thresholds.reprojection_px, _RANSAC_ITERATIONS
+        tolerance = thresholds.reprojection_px
         T_start, inliers = consensus(
-            points_known, pixels_known, K, iterations, tolerance, self._seed
+            points_known, pixels_known, K, _RANSAC_ITERATIONS, tolerance, self._seed
         )
         count = len(inliers)
         if count < thresholds.min_inliers or count < thresholds.min_inlier_ratio * len(known):
             return f"only {count} of {len(known)} matches are inliers"
-        extent = pixels_known[inliers].std(axis=0) / [
-            self._intrinsics.width,
-            self._intrinsics.height,
-        ]
+        size = [self._intrinsics.width, self._intrinsics.height]
+        extent = pixels_known[inliers].std(axis=0) / size
         if extent[0] < _MIN_SPREAD_RATIO or extent[1] < _MIN_SPREAD_RATIO / 2:
             return f"{count} inliers in a small part of the image"
         seen = resect([T_start], points_known[inliers], pixels_known[inliers], K)
-        return Sighting(
-            seen.T_camera_world,
-            seen.sigmas,
-            known[inliers],
-            float(np.median(points_known[inliers, 2])),
-        )
+        depth = float(np.median(points_known[inliers, 2]))
+        return Sighting(seen.T_camera_world, seen.sigmas, known[inliers], depth)
 
     def _sigmas(
         self,
@@ -264,8 +250,6 @@ def _scale(
         return None
     seen_by_second = apply(forward.T_camera_points, points_first[both].astype(np.float64))[:, 2]
     seen_by_first = apply(backward.T_camera_points, points_second[both].astype(np.float64))[:, 2]
-    ratios = (
-        np.median(seen_by_second / points_second[both, 2]),
-        np.median(points_first[both, 2] / seen_by_first),
-    )
-    return float(np.sqrt(ratios[0] * ratios[1]))
+    by_second = np.median(seen_by_second / points_second[both, 2])
+    by_first = np.median(points_first[both, 2] / seen_by_first)
+    return float(np.sqrt(by_second * by_first))

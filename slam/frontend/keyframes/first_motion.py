@@ -53,9 +53,8 @@ def first_motion(
         if ahead.any():
             unit = float(np.median(depth[ahead] / triangulated[ahead]))
             at = np.where(ahead, np.clip(unit * triangulated, 0.2 * depth, 5.0 * depth), depth)
-            R = Rotation.from_matrix(
-                motion.R_current_previous
-            ).as_matrix()  # OpenCV's are less exact
+            # OpenCV's are less exact
+            R = Rotation.from_matrix(motion.R_current_previous).as_matrix()
             starts.append((make(R, unit * motion.direction), at))
     rows = np.arange(len(pixels))
     sightings = Sightings(
@@ -66,10 +65,10 @@ def first_motion(
         np.full(2 * len(rows), DEPTH_SIGMA),
     )
     problem = BundleAdjustment(sightings, intrinsics, np.array([False, True]))
-    solved = [
-        problem.solve(np.stack([np.eye(4), T]), rays_before * z[:, None], *_LIMITS)
-        for T, z in starts
-    ]
+    solved = []
+    for T, z in starts:
+        poses = np.stack([np.eye(4), T])
+        solved.append(problem.solve(poses, rays_before * z[:, None], *_LIMITS))
     costs = np.array([adjusted.cost for adjusted in solved])
     best = solved[int(np.argmin(costs))] if costs.min() < costs[0] - _GAIN else solved[0]
     return best.T_camera_world[1], best.points[:, 2]

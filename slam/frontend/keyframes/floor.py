@@ -31,7 +31,8 @@ def units_by_floor(
 
     ``learned_units`` are those of learned depth per unit of each map, ``seed`` is that of the planes drawn.
     """
-    units, floors = list(learned_units), {}
+    units = list(learned_units)
+    floors: dict[int, float] = {}
     for row, local in enumerate(maps if len(maps) > 1 else ()):
         height = height_above_floor(local, seed)
         if height is not None:
@@ -48,7 +49,8 @@ def units_by_floor(
 def height_above_floor(local: LocalMap, seed: int = 0) -> float | None:
     """The median height of the keyframes above the plane below which nothing is; None where no such plane is seen."""
     T_map_camera = local.T_world_camera
-    centres, down = T_map_camera[:, :3, 3], T_map_camera[:, :3, 1].mean(axis=0)
+    centres = T_map_camera[:, :3, 3]
+    down = T_map_camera[:, :3, 1].mean(axis=0)
     seen = np.unique(np.concatenate([keyframe.track_ids for keyframe in local.keyframes]))
     points = local.points[seen[local.parallax(local.keyframes).settled[seen]]]
     if len(points) < _LEAST_POINTS:

@@ -39,11 +39,9 @@ def learned_units(local: LocalMap, carried: FloatArray) -> tuple[FloatArray, Flo
     # the scatter of the units of learned depth about that of the map, by keyframes that share no error
     apart = own[_SHARED:] - own[:-_SHARED]
     apart = apart[np.isfinite(apart)]
-    usual = (
-        float(np.clip(mad_sigma(apart) / np.sqrt(2.0), _LEAST_SIGMA, _SIGMA))
-        if len(apart) >= _SHARED
-        else _SIGMA
-    )
+    usual = _SIGMA
+    if len(apart) >= _SHARED:
+        usual = float(np.clip(mad_sigma(apart) / np.sqrt(2.0), _LEAST_SIGMA, _SIGMA))
     weight = np.where(np.isfinite(own), 0.5 / _SHARED / usual**2, 0.0)
     own = np.nan_to_num(own)
     system = np.zeros((2, len(own)))

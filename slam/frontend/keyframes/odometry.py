@@ -93,9 +93,8 @@ class KeyframeOdometry:
         self._turn_rate = np.zeros(3)  # a second, where the shutter rolls
         self._small: SmallImage = np.zeros((0, 0), np.float32)
         self.events: list[TrackingEvent] = []
-        self._spread: FloatArray | None = (
-            None  # of the points of the last keyframe, once they are looked for
-        )
+        # of the points of the last keyframe, once they are looked for
+        self._spread: FloatArray | None = None
         self._relocalises = relocalises
         self._relocaliser: Relocaliser | None = None  # of the lost map
 
@@ -115,9 +114,8 @@ class KeyframeOdometry:
 
     def _relocalise(self, lost: LocalMap, frame: Frame) -> None:
         """Look for the camera in the lost map; where it is found, the map goes on with this frame as a keyframe."""
-        if (
-            self._relocaliser is None or self._relocaliser.local is not lost
-        ):  # one that begins may be lost at once
+        # one that begins may be lost at once
+        if self._relocaliser is None or self._relocaliser.local is not lost:
             self._relocaliser = Relocaliser(lost, self._intrinsics, self._seed)
         corners = new_corners(frame.grey, _NOTHING[1], _MAX_CORNERS)
         unknown = np.full((len(corners), 3), np.nan, np.float32)
@@ -146,9 +144,8 @@ class KeyframeOdometry:
         images = before, self._small, self._T_last_step[:3, :3], shift, self._intrinsics
         turn = image_turn(*images) if np.hypot(*shift) > _LEAST_SHIFT_PX else None
         since, self._stamp = frame.stamp - self._stamp, frame.stamp
-        if (
-            not self.segments or not self.segments[-1].started
-        ):  # without learned depth there are no points
+        # without learned depth there are no points
+        if not self.segments or not self.segments[-1].started:
             del self.segments[-1:]
             self._begin(frame)
             return
@@ -219,11 +216,9 @@ class KeyframeOdometry:
         corners = keyframe.places[rows].astype(np.float32)
         tracked, kept = track(keyframe.grey, frame.grey, corners, KEYFRAME_SEARCH, guesses)
         kept &= are_inside(tracked, frame.grey.shape)
-        shift = (
-            np.median(tracked[kept] - guesses[kept], axis=0)
-            if kept.any()
-            else np.zeros(2, np.float32)
-        )
+        shift = np.zeros(2, np.float32)
+        if kept.any():
+            shift = np.median(tracked[kept] - guesses[kept], axis=0)
         self._places[rows] = np.where(kept[:, None], tracked, guesses + shift)
         return keyframe.track_ids[rows[kept]], tracked[kept]
 
@@ -262,11 +257,9 @@ class KeyframeOdometry:
         if self._spread is None:
             self._spread = segment.spread(self._intrinsics)
         spread = self._spread[np.searchsorted(segment.keyframes[-1].track_ids, track_ids)]
-        before = (
-            np.isin(track_ids, segment.frames[-1].track_ids)
-            if segment.frames
-            else np.zeros(0, np.bool_)
-        )
+        before = np.zeros(0, np.bool_)
+        if segment.frames:
+            before = np.isin(track_ids, segment.frames[-1].track_ids)
         trusted = before if before.sum() >= MIN_POINTS else None
         pose = resect(
             guesses,
@@ -287,11 +280,9 @@ class KeyframeOdometry:
         settled = segment.parallax(segment.keyframes[-_LOOKED_BACK:]).settled[track_ids]
         if settled.sum() >= MIN_POINTS or known.sum() < MIN_POINTS:
             return
-        tracks, pixels_before, now = (
-            track_ids[known],
-            before.pixels[rows[known]],
-            pixels[known].astype(np.float64),
-        )
+        tracks = track_ids[known]
+        pixels_before = before.pixels[rows[known]]
+        now = pixels[known].astype(np.float64)
         depth = apply(before.T_camera_world, segment.points[tracks])[:, 2]
         T = self._T_camera_world @ invert(before.T_camera_world)
         T_now_before, depth = first_motion(
@@ -305,17 +296,14 @@ class KeyframeOdometry:
         self, last: TrackedKeyframe, track_ids: TrackIds, pixels: Pixels
     ) -> tuple[float, float]:
         """Median parallax, and median shift, of corners ``(M, 2)`` since a keyframe, over the width of the image."""
-        intrinsics, before = (
-            self._intrinsics,
-            last.pixels[np.searchsorted(last.track_ids, track_ids)],
-        )
+        intrinsics = self._intrinsics
+        before = last.pixels[np.searchsorted(last.track_ids, track_ids)]
         R = self._T_camera_world[:3, :3] @ last.T_camera_world[:3, :3].T
         rays_before, rays = intrinsics.rays(before), intrinsics.rays(pixels.astype(np.float64))
         parallax = parallax_px(rays_before, rays, R, (intrinsics.fx, intrinsics.fy))
         shift = np.linalg.norm(pixels - before, axis=1)
-        return float(np.median(parallax)) / intrinsics.width, float(
-            np.median(shift)
-        ) / intrinsics.width
+        width = intrinsics.width
+        return float(np.median(parallax)) / width, float(np.median(shift)) / width
 
     def _add_keyframe(
         self, segment: LocalMap, frame: Frame, track_ids: TrackIds, pixels: Pixels
@@ -328,25 +316,20 @@ class KeyframeOdometry:
             image = NewImage(frame.grey, T, intrinsics)
             pixels = segment.aligned(image, track_ids, pixels)
             again, reprojected = segment.found_again(image, track_ids)
-            track_ids, pixels = (
-                np.concatenate([track_ids, again]),
-                np.concatenate([pixels, reprojected]),
-            )
+            track_ids = np.concatenate([track_ids, again])
+            pixels = np.concatenate([pixels, reprojected])
         fresh = new_corners(frame.grey, pixels, _MAX_CORNERS - len(pixels))
         track_ids = np.concatenate([track_ids, segment.new_tracks(len(fresh))])
         pixels = np.concatenate([pixels, fresh])
         order = np.argsort(track_ids)
         track_ids, places = track_ids[order], pixels[order].astype(np.float64)
         unknown = np.full(len(track_ids), np.nan)
-        middle, descriptors = (
-            in_middle_row(places, self._turn_rate, intrinsics),
-            describe(frame.grey, places),
+        middle = in_middle_row(places, self._turn_rate, intrinsics)
+        descriptors = describe(frame.grey, places)
+        keyframe = TrackedKeyframe(
+            frame.index, T, track_ids, middle, places, unknown, descriptors, frame.grey
         )
-        segment.add(
-            TrackedKeyframe(
-                frame.index, T, track_ids, middle, places, unknown, descriptors, frame.grey
-            )
-        )
+        segment.add(keyframe)
         if is_tracked:
             gone = segment.adjust(intrinsics)
             segment.keyframes[-1] = segment.keyframes[-1].without(gone)

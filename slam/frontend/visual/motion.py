@@ -73,15 +73,13 @@ class Motion:
         T_previous_current = self.relative_pose.T_from_to.copy()
         T_previous_current[:3, 3] *= length / self.length_unscaled
         of_unit_pose = np.hypot(self.corner_sigmas, noise)
-        sigmas, correlated_sigmas = (
-            pose_sigmas(T_previous_current, of_unit_pose, sigma)
-            for sigma in (relative_sigma, relative_correlated_sigma)
-        )
         return replace(
             self.relative_pose,
             T_from_to=T_previous_current,
-            sigmas=sigmas,
-            correlated_sigmas=correlated_sigmas,
+            sigmas=pose_sigmas(T_previous_current, of_unit_pose, relative_sigma),
+            correlated_sigmas=pose_sigmas(
+                T_previous_current, of_unit_pose, relative_correlated_sigma
+            ),
         )
 
 

@@ -55,12 +55,8 @@ def step_noise(motions: Mapping[Ends, Motion], frames: int) -> dict[Ends, FloatA
     jitter = _unexplained(rotation_jitter(values[:, :3]), np.nanmedian(own[:, :3], axis=0))
     residual = _unexplained(neighbour_residual(values), _NEIGHBOUR_RESIDUAL_OF_NOISE * own)
     across = np.sqrt(np.maximum(1.0 - values[:, 3:] ** 2, 0.0))
-    by_jitter = np.hstack(
-        [
-            np.tile(JITTER_ROTATION * jitter, (len(values), 1)),
-            JITTER_DIRECTION * np.linalg.norm(jitter) * across,
-        ]
-    )
+    turns = np.tile(JITTER_ROTATION * jitter, (len(values), 1))
+    by_jitter = np.hstack([turns, JITTER_DIRECTION * np.linalg.norm(jitter) * across])
     noise = np.hypot(by_jitter, _NEIGHBOUR * residual)
     return {ends: noise[row] for ends, row in place.items()}
 
@@ -85,7 +81,8 @@ def neighbour_residual(values: FloatArray) -> FloatArray:
     to one bad neighbour. Values are in the order of the drive, NaN where unknown.
     """
     padded = np.pad(values, ((2, 2), (0, 0)), constant_values=np.nan)
-    earlier, before, after, later = (padded[n : n + len(values)] for n in (0, 1, 3, 4))
+    earlier, before = padded[:-4], padded[1:-3]
+    after, later = padded[3:-1], padded[4:]
     predicted = np.array([0.5 * before + 0.5 * after, 2.0 * before - earlier, 2.0 * after - later])
     predicted[0] = np.where(np.isnan(predicted).all(axis=0), values, predicted[0])
     known = np.isfinite(values[:, 0])

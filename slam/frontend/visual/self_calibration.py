@@ -91,7 +91,8 @@ class DepthError:
             length: of the motion, in the unit of learned depth.
         """
         known = np.isfinite(learned)
-        ratio, spread = (learned[known] * values[known] / length for values in (nearness, sigma))
+        ratio = learned[known] * nearness[known] / length
+        spread = learned[known] * sigma[known] / length
         weights = 1.0 / (1.0 + (spread / _USUAL_SIGMA) ** 2)
         corners, noise = _KEPT * self.corners, _KEPT * self.noise
         depths = _nearest(np.log2(learned[known]), np.log2(_DEPTHS))

@@ -75,14 +75,25 @@ class Agreement:
         return self
 
     def required(self) -> Agreement:
-        """As `said`, of a source that the run has to take; ``SlamError`` where it is wrong."""
+        """As `said`, of a source that the run has to take.
+
+        Raises:
+            SlamError: the source is wrong.
+        """
         if self.is_wrong:
             raise SlamError(f"{self}; check its files and settings, or run without it")
         return self.said()
 
 
 def of_height(source: str, implied_m: float, stated_m: float | None, spread: float) -> Agreement:
-    """By the camera's height above the road that lengths of the source imply, with the relative spread of the road."""
+    """By the camera's height above the road.
+
+    Args:
+        source: its name in a sentence.
+        implied_m: the height that lengths of the source imply, metres.
+        stated_m: the height that the user or the data set states, metres; None where nobody does.
+        spread: relative sigma of the road that the images show.
+    """
     wanted, noise = (
         (_USUAL_HEIGHT_M, np.log(_USUAL_FACTOR)) if stated_m is None else (stated_m, _HEIGHT)
     )
@@ -96,7 +107,16 @@ def of_height(source: str, implied_m: float, stated_m: float | None, spread: flo
 def of_steps(
     source: str, steps: Sequence[RelativePose], motions: Mapping[Ends, Motion]
 ) -> Agreement | None:
-    """By rotations and directions of the steps that both measured; None where these are few."""
+    """By rotations and directions of the steps that both measured.
+
+    Args:
+        source: its name in a sentence.
+        steps: as the source measured them, in any unit.
+        motions: as the images measured them, by their frames.
+
+    Returns:
+        None where fewer than five steps were measured by both.
+    """
     both = [step for step in steps if step.ends in motions]
     if len(both) < _LEAST:
         return None
@@ -125,7 +145,14 @@ def of_steps(
 def of_positions(
     source: str, distances: FloatArray, sigmas: FloatArray, path_m: float
 ) -> Agreement:
-    """By distances ``(M,)`` of the aligned path from its positions with ``sigmas`` ``(M,)``, metres."""
+    """By the distances of the aligned path from positions of the source.
+
+    Args:
+        source: its name in a sentence.
+        distances: ``(M,)``, metres.
+        sigmas: of the positions ``(M,)``, metres.
+        path_m: length of the path, of which an alignment keeps a small part as drift.
+    """
     noise = np.hypot(sigmas, _DRIFT * path_m)
     median = float(np.median(distances))
     return Agreement(
@@ -239,7 +266,16 @@ def of_focal_length(found: FocalLength, camera: Intrinsics) -> Agreement | None:
 def confidence(
     agreements: Iterable[Agreement], is_metric: bool, is_carried: bool
 ) -> float | Failed:
-    """The share of drives with as large a contradiction that err by at most 1 % of their path; where known of such."""
+    """The share of drives with as large a contradiction that err by at most 1 % of their path.
+
+    Args:
+        agreements: of all sources of the drive.
+        is_metric: whether lengths are in metres.
+        is_carried: whether a person carries the camera.
+
+    Returns:
+        A failure for drives of which it is not known.
+    """
     if is_carried:
         return Failed("it is calibrated on roads, not for a camera that is carried")
     if not is_metric:

@@ -22,8 +22,13 @@ def complete_drive(
 ) -> Drive:
     """The drive with its gaps interpolated, its rotations smoothed, its road by its path, and its segments.
 
-    More frames may follow: the collected drive stays as it is. ``sources`` are those of a snippet, ``map_poses`` are by
-    its maps of keyframes, which loops join at ``joins``.
+    More frames may follow: the collected drive stays as it is.
+
+    Args:
+        drive: as it was collected.
+        sources: frames of a snippet besides its target.
+        map_poses: poses by the maps of keyframes of the drive.
+        joins: events of loops that join these maps.
 
     Raises:
         SlamError: no snippet was measured, so there is no motion to extrapolate.

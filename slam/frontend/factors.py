@@ -53,8 +53,14 @@ def make_factors(
 ) -> list[RelativePose]:
     """All relative poses of a completed drive with their noise, in the unit of the scale.
 
-    The least certain come first, and odometry is chained by the last ones; steps by LiDAR, in metres, stand before
-    those of image geometry. What the pose network measured is a line in the log of this ``level``.
+    The least certain come first, and odometry is chained by the last ones; steps by LiDAR stand
+    before those of image geometry.
+
+    Args:
+        drive: completed.
+        scale: of that drive.
+        lidar_steps: steps by LiDAR, metres.
+        level: of the line in the log that says what the pose network measured.
     """
     maps = drive.map_poses
     geometric = []
@@ -183,9 +189,13 @@ def calibrate_network(
 ) -> NetworkCalibration:
     """The unit and the noise of the network's steps, by the poses that image geometry measured too.
 
-    At a frame, they are medians over the pairs nearest in time. With fewer than 20 pairs, lengths are in the unit of
-    learned depth, and accordingly uncertain. Steps ``T_k_next`` are unscaled; ``depth_unit`` ``(N,)`` is the unit of
-    the ``geometric`` poses per unit of learned depth at each frame.
+    At a frame, they are medians over the pairs nearest in time. With fewer than 20 pairs, lengths are
+    in the unit of learned depth, and accordingly uncertain.
+
+    Args:
+        steps: ``T_k_next`` by k, unscaled.
+        geometric: poses by image geometry, also across several frames.
+        depth_unit: unit of these poses per unit of learned depth at each frame ``(N,)``.
     """
     pairs, by_network = [], []
     for pose in geometric:

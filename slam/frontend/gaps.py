@@ -34,8 +34,13 @@ def interpolate_gaps(
 ) -> Drive:
     """The drive with steps and snippets in its gaps, and without what was measured on interpolated frames.
 
-    Steps over a gap are between its two ends. No snippet measures across ``cuts``, which show another place than the
-    frame before.
+    Steps over a gap are between its two ends. No snippet measures across a cut.
+
+    Args:
+        drive: as it was collected.
+        sources: frames of a snippet besides its target.
+        cuts: frames that show another place than the frame before.
+        map_poses: poses by the maps of keyframes of the drive.
 
     Raises:
         SlamError: no snippet was measured, so there is no motion to extrapolate.

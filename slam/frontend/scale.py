@@ -132,9 +132,17 @@ def find_scale(
     drive: Drive,
     lidar_steps: Sequence[RelativePose],
 ) -> Scale:
-    """All lengths of a run in metres, or in camera heights where no mode gives metres (none, reference, known, gps).
+    """All lengths of a run in metres, or in camera heights where the mode gives no metres.
 
-    Without a road in most frames, the planes that were found give no unit that means anything.
+    Modes none, reference, known and gps give none here. Without a road in most frames, the planes
+    that were found give no unit that means anything.
+
+    Args:
+        mode: resolved.
+        camera_height_m: above the road, of mode camera-height; in mode lidar it stands in for the one
+            that the scans measure.
+        drive: completed.
+        lidar_steps: steps by LiDAR, metres, of mode lidar.
     """
     motions = triangulated(drive.steps)
     frames = len(drive)
@@ -318,7 +326,16 @@ def known_frames(config: ScaleConfig, stamps: FloatArray) -> tuple[int, int]:
 def scale_from_distance(
     T_world_camera_unscaled: FloatArray, stamps: FloatArray, config: ScaleConfig
 ) -> ScaleEstimate | Failed:
-    """The known distance of two frames over their estimated distance; raises as `known_frames`."""
+    """The known distance of two frames over their estimated distance.
+
+    Args:
+        T_world_camera_unscaled: poses of all frames ``(N, 4, 4)``.
+        stamps: of all frames ``(N,)``, seconds.
+        config: says which two frames, and how far they are apart.
+
+    Raises:
+        SlamError: a frame or stamp outside the drive, or twice the same frame.
+    """
     first, second = known_frames(config, stamps)
     apart = np.linalg.norm(
         T_world_camera_unscaled[second, :3, 3] - T_world_camera_unscaled[first, :3, 3]
@@ -335,6 +352,11 @@ def scale_track(
 
     The unit of learned depth drifts along a drive. Where the 41 frames around a frame hold too few
     usable planes, the estimate of the whole drive is used.
+
+    Args:
+        roads: the camera's unscaled height over the ground plane of each frame.
+        height: the same height in the unit of the result.
+        estimate: of the whole drive.
     """
     ratios = _ratios(roads, height)
     bound = _REJECTION_SIGMAS * max(estimate.spread, 0.02)

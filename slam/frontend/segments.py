@@ -40,9 +40,14 @@ def find_segments(
     interpolated: Mapping[int, str],
     is_related: Callable[[int], bool],
 ) -> list[Segment]:
-    """The segments of a drive of so many frames, by its cuts and its long gaps.
+    """The segments of a drive, by its cuts and its long gaps.
 
-    ``is_related`` tells of a frame whether a map of keyframes relates the frames from it on to those before.
+    Args:
+        count: frames of the drive.
+        cuts: frames that show another place than the frame before.
+        interpolated: frames of gaps, with the reason.
+        is_related: tells of a frame whether a map of keyframes relates the frames from it on to
+            those before.
     """
     between = [cut for cut in cuts if not is_related(cut)]
     begins = {0: ""} | dict.fromkeys(between, "it shows another place than the frame before")

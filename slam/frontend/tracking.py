@@ -225,7 +225,12 @@ class CornerTracker:
     ) -> Tracks:
         """Corners of ``previous`` tracked to ``current``.
 
-        The flow between them may be predicted; pixels that are ``standing`` ``(h, w)`` do not belong to the world.
+        Args:
+            previous: the frame before.
+            current: the later frame.
+            predicted_flow: between them; None where nothing predicts it.
+            standing: pixels ``(h, w)`` of images of any size that do not show the world; None where
+                all do.
         """
         if previous.index not in self._corners:
             self._fill(previous, np.zeros((0, 2), np.float32), np.zeros(0, np.int64), standing)

@@ -104,8 +104,13 @@ def close_loops(
 ) -> LoopClosures:
     """Find the loops of a drive, once after its last frame.
 
-    The ``views`` are in time order, their points in the unit of the odometry ``T_world_camera`` ``(N, 4, 4)``, which
-    ``is_metric`` or not.
+    Args:
+        views: in time order, their points in the unit of the odometry.
+        T_world_camera: the odometry ``(N, 4, 4)``.
+        intrinsics: of all views.
+        config: whether loops are sought.
+        is_metric: whether the unit of the odometry is the metre.
+        seed: of RANSAC.
     """
     if not config.enabled:
         return LoopClosures(not_sought="loop closure is switched off (loops.enabled)")
@@ -127,8 +132,11 @@ def find_loops(
 ) -> LoopClosures:
     """Loops among the views of a track that are verified and agree with each other.
 
-    The views are in time order, of some rows of the track, their points in the units of their maps; ``apart`` says
-    which may make a loop, see `find_candidates`.
+    Args:
+        views: in time order, of some rows of the track, their points in the units of their maps.
+        track: odometry of the drive or of the keyframes of its maps.
+        apart: says which views may make a loop, see `find_candidates`.
+        verifier: measures the candidates.
     """
 
     def verdicts(candidates: Iterable[Candidate]) -> list[Loop | RejectedLoop]:
@@ -212,7 +220,11 @@ def find_candidates(
 ) -> list[Candidate]:
     """For each view, in time order, the most similar earlier views, the best first.
 
-    ``apart`` says of some views ``(B,)``, by their rows, and of all views whether they may make a loop ``(B, V)``.
+    Args:
+        views: in time order.
+        apart: says of some views ``(B,)``, by their rows, and of all views whether they may make a
+            loop ``(B, V)``.
+        thresholds: how many candidates a view has, how similar, and how far from each other.
     """
     if len(views) < 2 or not any(map(len, views)):
         return []
@@ -277,7 +289,10 @@ def agreeing(
 ) -> tuple[list[Loop], list[RejectedLoop]]:
     """Split verified loops into consistent ones, and ones without support or in conflict with others.
 
-    They are in the unit of the map of their earlier end.
+    Args:
+        loops: in the unit of the map of their earlier end.
+        track: odometry that they should agree with.
+        thresholds: of the support that a loop needs, and of the drift it may correct.
     """
     possible: list[Loop] = []
     kept: list[Loop] = []

@@ -130,7 +130,13 @@ class LoopVerifier:
         self._seed = seed
 
     def verify(self, earlier: View, later: View, score: float) -> Loop | RejectedLoop:
-        """Measure the pose of the later view in the earlier one, or reject it with a reason."""
+        """Measure the pose of the later view in the earlier one, or reject it with a reason.
+
+        Args:
+            earlier: a view with points in its own camera, NaN where unknown.
+            later: the same, of the same camera or another one of the same intrinsics.
+            score: similarity of both, which is kept with the verdict.
+        """
         rows_earlier, rows_later = matches(earlier, later, self.thresholds)
 
         def refused(reason: str, inliers: int = 0) -> RejectedLoop:

@@ -77,7 +77,15 @@ class BundleAdjustment:
         pixel_sigma: float = PIXEL_SIGMA,
         huber: float = _HUBER,
     ) -> None:
-        """Prepare to adjust the cameras that are ``free`` ``(K,)``; residuals beyond ``huber`` sigmas weigh less."""
+        """Prepare to adjust cameras and points.
+
+        Args:
+            sightings: of the points by the cameras.
+            intrinsics: of all cameras.
+            free: cameras that are adjusted ``(K,)``; the others stay.
+            pixel_sigma: of a sighting, pixels.
+            huber: sigmas beyond which residuals weigh less.
+        """
         self._seen, self._pixel_sigma, self._huber = sightings, pixel_sigma, huber
         self._focal = np.array([intrinsics.fx, intrinsics.fy])
         self._rays = intrinsics.rays(sightings.pixels)[:, :2]
@@ -109,7 +117,14 @@ class BundleAdjustment:
         iterations: int,
         tolerance: float = 1e-4,
     ) -> Adjusted:
-        """Adjust from a start until the cost falls by less than ``tolerance`` of itself."""
+        """Adjust from a start.
+
+        Args:
+            T_camera_world: of all cameras ``(K, 4, 4)``.
+            points: in the world ``(P, 3)``.
+            iterations: the most.
+            tolerance: the relative fall of the cost at which it ends.
+        """
         T, X = T_camera_world.copy(), points.copy()
         residuals = self.residuals(T, X)
         cost = self._cost(residuals)

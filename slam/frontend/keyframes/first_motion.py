@@ -40,7 +40,13 @@ def first_motion(
 ) -> tuple[FloatArray, FloatArray]:
     """``T_now_before`` of two views, and the depth in the first one ``(M,)``, in the unit of a prior.
 
-    From corners at ``pixels_before`` and ``pixels`` ``(M, 2)`` with ``depth`` ``(M,)`` in the first view by the prior.
+    Args:
+        T_now_before: of the first start, in the unit of the prior.
+        pixels_before: corners in the first view ``(M, 2)``.
+        pixels: the same corners in the second view ``(M, 2)``.
+        depth: of the corners in the first view ``(M,)``, by the prior.
+        intrinsics: of both views.
+        seed: of RANSAC.
     """
     rays_before, rays = intrinsics.rays(pixels_before), intrinsics.rays(pixels)
     tolerance = _INLIER_PX / intrinsics.fx

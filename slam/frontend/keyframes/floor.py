@@ -27,9 +27,14 @@ _MOST_CONTRADICTION = np.log(1.4)  # between two units of a map: a table is half
 def units_by_floor(
     maps: Sequence[LocalMap], learned_units: Sequence[float], seed: int = 0
 ) -> list[float]:
-    """The units of maps, so that the camera has one height in all that see a floor; learned ones where it contradicts.
+    """The units of maps, so that the camera has one height in all that see a floor.
 
-    ``learned_units`` are those of learned depth per unit of each map, ``seed`` is that of the planes drawn.
+    They are the learned ones where the floor contradicts these.
+
+    Args:
+        maps: all of one drive.
+        learned_units: of learned depth per unit of each map.
+        seed: of the planes that are drawn.
     """
     units = list(learned_units)
     floors: dict[int, float] = {}

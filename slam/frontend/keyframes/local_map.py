@@ -254,7 +254,16 @@ class LocalMap:
         limits: tuple[int, float],
         outlier_px: float = OUTLIER_PX,
     ) -> tuple[list[TrackIds], TrackIds]:
-        """Adjust the chosen keyframes but the first ``fixed``, and the points that `sightings` gave of them.
+        """Adjust some keyframes and their points.
+
+        Args:
+            chosen: rows of the keyframes.
+            fixed: how many of them stay, the first ones.
+            sightings: of the chosen keyframes, by `sightings`.
+            track_ids: of their points, by `sightings`.
+            intrinsics: of all images.
+            limits: iterations, and the relative fall of the cost at which it ends.
+            outlier_px: residual of a sighting that is taken out, pixels.
 
         Returns:
             Tracks whose sightings were taken out of each keyframe as outliers, and those that thereby lost their point.

@@ -77,10 +77,14 @@ class KeyframeOdometry:
         on_keyframe: Callable[[Frame], None] = lambda frame: None,
         relocalises: bool = False,
     ) -> None:
-        """Prepare for the first frame; ``seed`` is that of RANSAC.
+        """Prepare for the first frame.
 
-        ``on_keyframe`` is told of a keyframe before it is adjusted, so that its depth is predicted meanwhile. Where it
-        ``relocalises``, a lost camera is looked for among all keyframes of its map.
+        Args:
+            intrinsics: of all frames.
+            seed: of RANSAC.
+            on_keyframe: is told of a keyframe before it is adjusted, so that its depth is predicted
+                meanwhile.
+            relocalises: whether a lost camera is looked for among all keyframes of its map.
         """
         self._intrinsics = intrinsics
         self._seed = seed

@@ -95,7 +95,14 @@ NO_MAPS = KeyframePoses()
 def keyframe_poses(
     maps: Sequence[LocalMap], intrinsics: Intrinsics, seed: int = 0, loops: Sequence[Ends] = ()
 ) -> KeyframePoses:
-    """All relative poses of the maps of a drive; ``loops`` are keyframes of one map that see one place, by frames."""
+    """All relative poses of the maps of a drive.
+
+    Args:
+        maps: in time order; those without points give none.
+        intrinsics: of all images.
+        seed: of RANSAC.
+        loops: frames of two keyframes of one map that see one place.
+    """
     poses: list[RelativePose] = []
     closing: dict[Ends, RelativePose] = {}
     segments: dict[int, int] = {}

@@ -254,9 +254,14 @@ def join(
 
 
 def moved(segment: LocalMap, T_world_camera: FloatArray, scales: FloatArray) -> LocalMap:
-    """A map by new poses ``(K, 4, 4)`` and units ``(K,)`` of its keyframes.
+    """A map by new poses and units of its keyframes.
 
     Points follow the first keyframe that sees them, frames the last keyframe before them.
+
+    Args:
+        segment: stays as it is.
+        T_world_camera: the new poses ``(K, 4, 4)``.
+        scales: units of that world per unit of the map, at each keyframe ``(K,)``.
     """
     points = np.full_like(segment.points, np.nan)
     for keyframe, T, scale in reversed(

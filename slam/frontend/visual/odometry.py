@@ -464,7 +464,18 @@ def most_credible(
     seconds: float,
     history: MotionHistory,
 ) -> Step | None:
-    """The step with most votes, the first of equal ones; None where more votes are against each than for it."""
+    """The step with most votes, the first of equal ones.
+
+    Args:
+        steps: estimates of one step; None for those that failed.
+        matches: corners in both images.
+        height_unscaled: of the camera above the road, in the unit of learned depth; None if unknown.
+        seconds: between both frames.
+        history: of the steps before.
+
+    Returns:
+        None where more votes are against each than for it.
+    """
     estimated = [step for step in steps if step is not None]
     balance = []
     for step in estimated:

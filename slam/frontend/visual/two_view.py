@@ -143,7 +143,16 @@ class TwoViewEstimate:
 
 
 def estimate(matches: Matches, history: MotionHistory, seed: int = 0) -> TwoViewEstimate | None:
-    """Rotation and direction of the next motion; None without a consensus. ``seed`` is that of RANSAC."""
+    """Rotation and direction of the next motion.
+
+    Args:
+        matches: corners in both images.
+        history: of the steps before, of which the last motion and the usual direction are tried.
+        seed: of RANSAC.
+
+    Returns:
+        None without a consensus.
+    """
     votes, prior, least = matches.votes, history.prior(), _EARLY_EXIT_INLIER_RATIO
     usual = _refined(matches, history.last, prior)
     if usual is not None and usual.agreeing[votes].mean() >= least:

@@ -1,6 +1,7 @@
 """How far a source of lengths, poses or depth contradicts the images' own motion, by robust statistics.
 
-Also how far the images of a drive are from those of good drives, and the confidence that follows from both.
+Also how far the images of a drive are from those of good drives, and the confidence that follows
+from both.
 """
 
 from __future__ import annotations

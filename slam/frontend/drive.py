@@ -94,18 +94,21 @@ class Drive:
     """Measurements of a drive in the networks' unit of length.
 
     Collected frame by frame, each list and dictionary growing at its end:
-        ``motions`` are all steps that image geometry measured, ``road_steps`` the lengths by the road's homography,
-        ``relative_rotations`` the rotations across several steps; ``failures`` are unmeasured steps with the reason.
-        ``roads`` has one entry a frame, the camera's height over the ground plane. ``unusable`` are frames without a
-        measurement, with the reason, ``repeated`` frames with the image of the one before, ``moving`` those of them
-        just before which the camera moved. ``depth_error`` is that of learned depth and ``focal_length`` the one that
-        corners show, as the steps have them. ``maps`` are those of keyframes and ``events`` what became of them; a
-        drive measured by steps alone has none.
+        ``motions`` are all steps that image geometry measured, ``road_steps`` the lengths by the
+        road's homography, ``relative_rotations`` the rotations across several steps; ``failures``
+        are unmeasured steps with the reason. ``roads`` has one entry a frame, the camera's height
+        over the ground plane. ``unusable`` are frames without a measurement, with the reason,
+        ``repeated`` frames with the image of the one before, ``moving`` those of them just before
+        which the camera moved. ``depth_error`` is that of learned depth and ``focal_length`` the
+        one that corners show, as the steps have them. ``maps`` are those of keyframes and
+        ``events`` what became of them; a drive measured by steps alone has none.
 
-    Added by `slam.frontend.completion.complete_drive`, which also leaves out views and keyframes of interpolated
-    frames, fills ``snippets`` to one a target, and smooths the rotations of ``motions``:
-        ``trusted`` are the snippets that the network measured on usable frames, ``interpolated`` the frames of gaps
-        with the reason, ``gap_steps`` their steps, ``map_poses`` the poses by the maps.
+    Added by `slam.frontend.completion.complete_drive`, which also leaves out views and keyframes of
+    interpolated frames, fills ``snippets`` to one a target, and smooths the rotations of
+    ``motions``:
+        ``trusted`` are the snippets that the network measured on usable frames, ``interpolated``
+        the frames of gaps with the reason, ``gap_steps`` their steps, ``map_poses`` the poses by
+        the maps.
     """
 
     snippets: list[SnippetPoses] = field(default_factory=list)

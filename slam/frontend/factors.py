@@ -1,7 +1,8 @@
 """All relative-pose factors of a run, made once from all measurements, and the odometry chained from them.
 
-The pose network's lengths have a unit of their own, which is not that of learned depth and changes with the street.
-Both it and the network's noise are measured against the steps of image geometry (``docs/design/learned-priors.md``).
+The pose network's lengths have a unit of their own, which is not that of learned depth and changes
+with the street. Both it and the network's noise are measured against the steps of image geometry
+(``docs/design/learned-priors.md``).
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ _NEAREST_PAIRS = 40  # in time, by which they are measured
 _LONGEST_PAIR = 4  # frames: as far as a snippet reaches
 _SHORTEST_PAIR = 0.1  # over the median length of a step: shorter ones say nothing about the unit
 _CORRELATED_STEPS = 50  # over which errors are taken as equal
-# of a step whose noise is not measured: radians, and over its length in the unit of learned depth, from which that of
-# the network differs by so much from drive to drive
+# of a step whose noise is not measured: radians, and over its length in the unit of learned depth,
+# from which that of the network differs by so much from drive to drive
 _USUAL_SIGMAS = np.repeat([np.deg2rad(0.3), 0.3], 3)
 _LEAST_SIGMAS = np.repeat([np.deg2rad(0.03), 0.02], 3)
 
@@ -109,8 +110,8 @@ def chain_odometry(factors: Sequence[RelativePose], count: int) -> FloatArray:
     """Odometry without a graph ``(count, 4, 4)``: each frame by the best factor that ends there.
 
     Args:
-        factors: in one unit, from earlier to later frames; one at least ends at every frame but the first. Of several
-            that are equally good and long, the last one is taken.
+        factors: in one unit, from earlier to later frames; one at least ends at every frame but the
+            first. Of several that are equally good and long, the last one is taken.
         count: frames.
     """
     arriving: dict[int, RelativePose] = {}
@@ -138,8 +139,10 @@ class NetworkCalibration:
 
     Attributes:
         unit: ``(N,)``, length per unscaled length of the step.
-        sigmas: ``(N, 6)`` of the step, rotation in radians, then translation over the usual length of a step.
-        pairs: steps that image geometry measured too; with fewer than 20 of them the unit is that of learned depth.
+        sigmas: ``(N, 6)`` of the step, rotation in radians, then translation over the usual length
+            of a step.
+        pairs: steps that image geometry measured too; with fewer than 20 of them the unit is that
+            of learned depth.
     """
 
     unit: FloatArray
@@ -189,8 +192,8 @@ def calibrate_network(
 ) -> NetworkCalibration:
     """The unit and the noise of the network's steps, by the poses that image geometry measured too.
 
-    At a frame, they are medians over the pairs nearest in time. With fewer than 20 pairs, lengths are
-    in the unit of learned depth, and accordingly uncertain.
+    At a frame, they are medians over the pairs nearest in time. With fewer than 20 pairs, lengths
+    are in the unit of learned depth, and accordingly uncertain.
 
     Args:
         steps: ``T_k_next`` by k, unscaled.
@@ -236,7 +239,8 @@ def network_factors(
         return []
     scaled = calibration.scaled(steps)
     lengths = np.array([np.linalg.norm(T_k_next[:3, 3]) for T_k_next in scaled.values()])
-    # sigmas by its own length would give a step that came out short more weight, and a drive that is too short
+    # sigmas by its own length would give a step that came out short more weight, and a drive that
+    # is too short
     usual = running_median(lengths, _NEAREST_PAIRS + 1)
     reach = np.maximum(usual, _SHORTEST_PAIR * np.median(lengths)).clip(1e-9)
     # with nothing beside them, the usual sigmas are wide enough by themselves
@@ -255,8 +259,8 @@ def network_factors(
 def chain_raw(snippets: Sequence[SnippetPoses], count: int) -> FloatArray:
     """The network trajectory: target to next source of each snippet, without a graph.
 
-    Frames before the first target and after the last come from the direct poses of these two snippets. There is one a
-    target, in time order without gaps.
+    Frames before the first target and after the last come from the direct poses of these two
+    snippets. There is one a target, in time order without gaps.
 
     Returns:
         ``T_world_camera`` ``(count, 4, 4)``, unscaled, the first the identity.
@@ -304,7 +308,8 @@ def join_gap_ends(
 ) -> list[RelativePose]:
     """The interpolated steps. Equal steps across a gap replace the steps in the gap if one map has both sides.
 
-    Constant velocity is a poor guess over a long gap, and many such steps would outvote the one pose by the map.
+    Constant velocity is a poor guess over a long gap, and many such steps would outvote the one
+    pose by the map.
 
     Args:
         interpolated: steps without a measurement, in one unit with all others.

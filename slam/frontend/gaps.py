@@ -106,9 +106,10 @@ def _without_frozen(
 ) -> tuple[set[int], Steps]:
     """Repeated frames during which the camera moved, and the steps that remain without them.
 
-    The length of the step to the next new image decides: short if the camera stood; the length of as many steps as
-    images were repeated if it moved. A length between the two is a failed match over a wide baseline and is not used.
-    Without a new image soon after the camera is assumed to stand.
+    The length of the step to the next new image decides: short if the camera stood; the length of
+    as many steps as images were repeated if it moved. A length between the two is a failed match
+    over a wide baseline and is not used. Without a new image soon after the camera is assumed to
+    stand.
     """
     frozen: set[int] = set()
     for first, last in runs(repeated):

@@ -35,7 +35,8 @@ class GroundPlaneFitter:
     def __init__(self, intrinsics: Intrinsics, seed: int = 0) -> None:
         """Sample the pixels of the trapezoid; ``seed`` is that of RANSAC."""
         self._seed = seed
-        # rows, columns (P,) and rays (P, 3) of about so many pixels; the horizon is taken at cy (a level camera)
+        # rows, columns (P,) and rays (P, 3) of about so many pixels; the horizon is taken at cy (a
+        # level camera)
         horizon, bottom = intrinsics.cy, intrinsics.height - 1.0
         top_row = horizon + _ROAD_ROWS[0] * (bottom - horizon)
         bottom_row = horizon + _ROAD_ROWS[1] * (bottom - horizon)

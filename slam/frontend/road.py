@@ -57,8 +57,9 @@ _Layer = NDArray[np.float32]
 class RoadStep:
     """What the images of the road say of the vector ``m`` ``(3,)`` of a step, whose norm is its length in heights.
 
-    ``information`` ``(3, 3)`` and ``right`` ``(3,)`` are their normal equations, without what is expected of the road's
-    normal; ``plane`` is their solution with it. ``relative_sigma`` is that of the length.
+    ``information`` ``(3, 3)`` and ``right`` ``(3,)`` are their normal equations, without what is
+    expected of the road's normal; ``plane`` is their solution with it. ``relative_sigma`` is that
+    of the length.
     """
 
     plane: FloatArray
@@ -80,8 +81,8 @@ class RoadStep:
 class RoadHomography:
     """Aligns the road between two frames of one sequence by its homography, and tracks the direction of motion.
 
-    A car ahead occludes most of a long strip of road and stands still in the image. Where the long strip fails, a
-    short and wide one is used, which ends before such a car; it is less accurate.
+    A car ahead occludes most of a long strip of road and stands still in the image. Where the long
+    strip fails, a short and wide one is used, which ends before such a car; it is less accurate.
     """
 
     def __init__(self, intrinsics: Intrinsics) -> None:
@@ -105,14 +106,16 @@ class RoadHomography:
             previous: the earlier frame, at the size of the intrinsics.
             current: the later frame.
             T_previous_current: its pose in the earlier camera, of any length but zero.
-            standing: pixels ``(h, w)`` of images of any size that do not show the world; None where all do.
+            standing: pixels ``(h, w)`` of images of any size that do not show the world; None where
+                all do.
         """
         if standing is not self._standing:
             self._standing, self._strips = standing, self._visible(standing)
         T_unit = T_previous_current.copy()
         T_unit[:3, 3] /= np.linalg.norm(T_unit[:3, 3])
         self._directions = (*self._directions, T_unit[:3, 3])[-_STEPS_KEPT:]
-        # of a level camera, pitched so that the motion is parallel to the road: the images alone tell pitch poorly
+        # of a level camera, pitched so that the motion is parallel to the road: the images alone
+        # tell pitch poorly
         expected = _normal_along(np.median(self._directions, axis=0))
         long, near = self._strips
         measured = self._measured_on(long, previous, current, T_unit, expected)
@@ -233,10 +236,11 @@ class RoadHomography:
 def with_slope(road_steps: Mapping[Ends, RoadStep], steps: Steps) -> dict[Ends, RoadStep]:
     """The lengths of a drive by the road, with the camera's pitch against it by the path of all ``steps``, unscaled.
 
-    A car pitches on its springs, by which a length errs by 7 to 8 % a degree, and the images of the road tell its pitch
-    poorly. Single directions of motion tell it poorly too, for the camera also rises and falls. Over eight metres
-    around a frame the path is parallel to the road; where directions are noisy, it is so only on the average of many
-    steps (``docs/design/scale-and-lengths.md``).
+    A car pitches on its springs, by which a length errs by 7 to 8 % a degree, and the images of the
+    road tell its pitch poorly. Single directions of motion tell it poorly too, for the camera also
+    rises and falls. Over eight metres around a frame the path is parallel to the road; where
+    directions are noisy, it is so only on the average of many steps
+    (``docs/design/scale-and-lengths.md``).
     """
     motions = {ends: motion for ends, motion in triangulated(steps).items() if ends in road_steps}
     if not motions:
@@ -293,8 +297,9 @@ def _interpolated(at: FloatArray, places: FloatArray, centres: FloatArray) -> Fl
 class _Strip:
     """Pixels ``(P,)`` that see a strip of a level road, rows from the first below the horizon, and rays ``(3, P)``.
 
-    They lie on a grid; ``places`` are their rows and columns there, ``coverage`` ``(H, W)`` is the blurred mask of
-    them, ``gradual`` the sigma of the blur, and ``relative_sigma`` that of step lengths.
+    They lie on a grid; ``places`` are their rows and columns there, ``coverage`` ``(H, W)`` is the
+    blurred mask of them, ``gradual`` the sigma of the blur, and ``relative_sigma`` that of step
+    lengths.
     """
 
     relative_sigma: float

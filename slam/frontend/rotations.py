@@ -34,9 +34,9 @@ _BLOCK = np.arange(9)
 def smooth_rotations(steps: Steps, relative_rotations: Sequence[RelativeRotation]) -> Steps:
     """The steps with rotations fitted robustly to single steps and relative rotations, directions corrected alike.
 
-    Least squares over one small rotation for each triangulated step, in its current camera. The residual of a
-    relative rotation is the sum of the corrections of its steps, each in its last camera. Rotations over a step that is
-    not triangulated are not used.
+    Least squares over one small rotation for each triangulated step, in its current camera. The
+    residual of a relative rotation is the sum of the corrections of its steps, each in its last
+    camera. Rotations over a step that is not triangulated are not used.
     """
     motions = triangulated(steps)
     by_start = shortest_by_start(motions)

@@ -1,15 +1,16 @@
 """The unit of a run and the lengths of its steps, by mode: camera height over the ground plane, LiDAR, a reference.
 
-A monocular step has a direction and no length. Three measurements give the length: points triangulated by two steps
-that share a frame give the ratio of both lengths; the road's homography gives it in camera heights; learned depth gives
-it in a unit that drifts. A vehicle's acceleration bounds the change of speed. In logarithms all of them are linear in
-the lengths ``x`` and the unit's deviation ``b``, with ``t`` the duration of a step:
+A monocular step has a direction and no length. Three measurements give the length: points
+triangulated by two steps that share a frame give the ratio of both lengths; the road's homography
+gives it in camera heights; learned depth gives it in a unit that drifts. A vehicle's acceleration
+bounds the change of speed. In logarithms all of them are linear in the lengths ``x`` and the unit's
+deviation ``b``, with ``t`` the duration of a step:
 
     x_k - x_{k-1} = ratio_k        x_k = road_k        x_k - b_k = learned_k        b_k - b_{k-1} = 0
     x_k - x_{k-1} = log(t_k / t_{k-1})
 
-solved for the whole drive by robust least squares, whose matrix is banded (``docs/design/scale-and-lengths.md``). The
-mode decides which measurements are absolute.
+solved for the whole drive by robust least squares, whose matrix is banded
+(``docs/design/scale-and-lengths.md``). The mode decides which measurements are absolute.
 """
 
 from __future__ import annotations
@@ -47,11 +48,13 @@ _ITERATIONS = 20
 _HUBER_ITERATIONS = 5
 _HUBER_K = 1.345
 _MOST_CORRELATED = 0.999
-# sigmas of logarithms: of a length by learned depth, measured on drives with truth, and least of the ratio of two steps
+# sigmas of logarithms: of a length by learned depth, measured on drives with truth, and least of
+# the ratio of two steps
 _LEARNED_SIGMA, _RATIO_SIGMA = 0.1, 0.004
 OUTLIER_SIGMAS = 2.0  # residual at which the robust weight of a measurement is one half
 _RATIO_WIDENING = 1.5  # factor on the sigma of a ratio measured by triangulated points
-# factor on the sigma of a length by learned depth where the road gives it too, whose errors fewer neighbours share
+# factor on the sigma of a length by learned depth where the road gives it too, whose errors fewer
+# neighbours share
 _BESIDE_ROAD = 4.0
 _UNIT_WALK_SIGMA = 0.003  # sigma per step of the random walk of learned depth's scale
 _UNIT_SIGMA = 0.2  # sigma of that scale by the learned ground plane
@@ -87,8 +90,8 @@ class StepLength(NamedTuple):
 class Scale:
     """``per_frame`` ``(N,)`` times an unscaled length near that frame is a length in ``unit``.
 
-    ``lengths`` of the steps that image geometry measured are in ``unit``. ``estimate`` is that of the mode's unit, or
-    why there is none.
+    ``lengths`` of the steps that image geometry measured are in ``unit``. ``estimate`` is that of
+    the mode's unit, or why there is none.
     """
 
     mode: ScaleMode
@@ -139,8 +142,8 @@ def find_scale(
 
     Args:
         mode: resolved.
-        camera_height_m: above the road, of mode camera-height; in mode lidar it stands in for the one
-            that the scans measure.
+        camera_height_m: above the road, of mode camera-height; in mode lidar it stands in for the
+            one that the scans measure.
         drive: completed.
         lidar_steps: steps by LiDAR, metres, of mode lidar.
     """
@@ -375,9 +378,10 @@ def _ratios(roads: Sequence[float | Failed], height: float) -> FloatArray:
 class StepEvidence:
     """Measurements of S steps, logarithms and their sigmas ``(S,)`` each, NaN where there is none.
 
-    ``ratio`` is the length over that of the step before; ``absolute`` the length in the mode's unit; ``learned``
-    the length by learned depth, already in the prior unit of the networks; ``steady`` the length over that of
-    the step before at constant speed, with the sigma that a vehicle's acceleration gives it.
+    ``ratio`` is the length over that of the step before; ``absolute`` the length in the mode's
+    unit; ``learned`` the length by learned depth, already in the prior unit of the networks;
+    ``steady`` the length over that of the step before at constant speed, with the sigma that a
+    vehicle's acceleration gives it.
     """
 
     ratio: FloatArray
@@ -398,10 +402,11 @@ class StepEvidence:
 class StepLengths:
     """``length`` ``(S,)`` of each step and its ``relative_sigma`` ``(S,)``, NaN without a measurement.
 
-    Errors of steps that share a ratio are correlated: along the drive their sum grows as that of independent errors of
-    ``relative_correlated_sigma`` ``(S,)``. ``unit_correction`` ``(S,)`` times the prior unit of learned depth
-    is its unit near that step. ``contradicted`` ``(S,)`` marks steps whose length is not what learned depth says, or
-    changes from the step before as no vehicle's does.
+    Errors of steps that share a ratio are correlated: along the drive their sum grows as that of
+    independent errors of ``relative_correlated_sigma`` ``(S,)``. ``unit_correction`` ``(S,)`` times
+    the prior unit of learned depth is its unit near that step. ``contradicted`` ``(S,)`` marks
+    steps whose length is not what learned depth says, or changes from the step before as no
+    vehicle's does.
     """
 
     length: FloatArray
@@ -504,13 +509,14 @@ def solve_lengths(evidence: StepEvidence) -> StepLengths:
 def marginals(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Marginals of every length from the upper band ``(3, 2 S)`` of an information matrix.
 
-    Each length is followed by the unit of its step. The matrix is block tridiagonal by step, so the marginal
-    information from all earlier and from all later steps is each a chain of 2x2 Schur complements.
+    Each length is followed by the unit of its step. The matrix is block tridiagonal by step, so the
+    marginal information from all earlier and from all later steps is each a chain of 2x2 Schur
+    complements.
 
     Returns:
-        Sigmas ``(S,)``, and correlations ``(S,)`` with the neighbours' lengths in [0, 1), the mean of both sides.
-        Errors whose correlation falls by a factor r from step to step have a sum of ``(1 + r) / (1 - r)`` times the
-        variance of independent ones.
+        Sigmas ``(S,)``, and correlations ``(S,)`` with the neighbours' lengths in [0, 1), the mean
+        of both sides. Errors whose correlation falls by a factor r from step to step have a sum of
+        ``(1 + r) / (1 - r)`` times the variance of independent ones.
     """
     neighbour, within, main = (band.reshape(-1, 2) for band in information)
     own = np.stack([main[:, 0], within[:, 1], within[:, 1], main[:, 1]], axis=1)
@@ -562,8 +568,8 @@ def _normal_equations(
 ) -> tuple[FloatArray, FloatArray]:
     """The upper band ``(3, N)`` of the weighted normal matrix with ``idle`` on its diagonal, and the right side.
 
-    Of equations ``state[plus] - state[minus] = value``, ``(M,)`` each; the place behind the last state is zero. None
-    ties states that are more than two places apart.
+    Of equations ``state[plus] - state[minus] = value``, ``(M,)`` each; the place behind the last
+    state is zero. None ties states that are more than two places apart.
     """
 
     def added(places: NDArray[np.intp], values: FloatArray) -> FloatArray:

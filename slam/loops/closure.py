@@ -1,8 +1,8 @@
 """Loop closure over a whole run: candidates, verified loops, and the consistent ones among them.
 
-Loops agree with the odometry and with each other by pairwise consistency as in PCM (Mangelson et al. 2018), between
-neighbours only: two loops whose ends are near each other must close a cycle with the two short stretches of odometry
-between their ends.
+Loops agree with the odometry and with each other by pairwise consistency as in PCM (Mangelson et
+al. 2018), between neighbours only: two loops whose ends are near each other must close a cycle with
+the two short stretches of odometry between their ends.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from slam.loops.vocabulary import PlaceIndex
 logger = logging.getLogger(__name__)
 
 MOST_REJECTED = 200
-# least distance of the two frames of a loop along the path: in metres, and over the median depth of the corners
+# least distance of the two frames of a loop along the path: in metres, and over the median depth of
+# the corners
 _LEAST_PATH_M = 15.0
 _LEAST_PATH_OVER_DEPTH = 0.75
 _LEAST_GAP_FRAMES = 30  # least distance of the two frames of a loop, frames
@@ -179,8 +180,9 @@ def _frames(views: Sequence[View]) -> NDArray[np.intp]:
 def _least_path(views: Sequence[View], is_metric: bool) -> float:
     """Least distance of the two frames of a loop along the path, in the unit of the points of the views.
 
-    It is 15 m. Where lengths are no metres, it is three quarters of the median depth of the corners: a camera that has
-    moved less still sees what it saw, whatever the unit and the frame rate, and on streets these are 12 to 19 m.
+    It is 15 m. Where lengths are no metres, it is three quarters of the median depth of the
+    corners: a camera that has moved less still sees what it saw, whatever the unit and the frame
+    rate, and on streets these are 12 to 19 m.
     """
     if is_metric:
         return _LEAST_PATH_M
@@ -192,7 +194,8 @@ def _least_path(views: Sequence[View], is_metric: bool) -> float:
 def _counted_once(loops: Sequence[Loop], path: FloatArray, near: float) -> list[Loop]:
     """The loops with the sigmas of one loop together wherever several join the same two places, of a car that waits.
 
-    Two frames less than ``near`` apart along the ``path`` ``(N,)`` show the same place with the same errors.
+    Two frames less than ``near`` apart along the ``path`` ``(N,)`` show the same place with the
+    same errors.
     """
     ends = path[np.array([loop.ends for loop in loops], int).reshape(-1, 2)]
     alike = (np.abs(ends[:, None] - ends) < near).all(axis=2).sum(axis=1)
@@ -261,8 +264,8 @@ def _peaks(scores: FloatArray, indices: NDArray[np.intp], thresholds: LoopThresh
 class Track:
     """Odometry ``T_world_camera`` ``(N, 4, 4)`` row by row: of the frames of a drive, or of the keyframes of its maps.
 
-    ``path`` ``(N,)`` grows by what odometry may err on. Lengths have one unit within each of ``maps`` ``(N,)``, and
-    maps that odometry relates have one of ``worlds`` ``(N,)``.
+    ``path`` ``(N,)`` grows by what odometry may err on. Lengths have one unit within each of
+    ``maps`` ``(N,)``, and maps that odometry relates have one of ``worlds`` ``(N,)``.
     """
 
     T_world_camera: FloatArray

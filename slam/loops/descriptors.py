@@ -17,8 +17,8 @@ from slam.frames import Descriptors, Grey
 from slam.geometry.se3 import FloatArray
 
 _SIFT_SIZE_PX = 8.0
-# terciles of square roots of SIFT's normed values (Arandjelovic and Zisserman 2012) over the corners
-# of a kitchen
+# terciles of square roots of SIFT's normed values (Arandjelovic and Zisserman 2012) over the
+# corners of a kitchen
 _LOW = 0.034
 _HIGH = 0.082
 _RADIUS_PX = 15  # around a corner, for its direction

@@ -78,7 +78,8 @@ class Places:
             version = int(content["format"])
         except FileNotFoundError as error:
             raise RunError(f"{path} is missing: run the sequence again") from error
-        # Damaged bytes raise almost anything in zipfile, zlib, tokenize and NumPy: no list of types is complete.
+        # Damaged bytes raise almost anything in zipfile, zlib, tokenize and NumPy: no list of types
+        # is complete.
         except Exception as error:
             reason = " ".join([f"{type(error).__name__}:", *str(error).split()])[:120]
             raise RunError(f"{path} is damaged ({reason}): run the sequence again") from error
@@ -100,7 +101,8 @@ class Places:
 class Tracks:
     """Points ``(P, 3)`` in the world, NaN where unknown, and their sightings ``(S,)``.
 
-    A sighting has the row of its place in ``views``, its row there in ``corners``, and that of its ``point``.
+    A sighting has the row of its place in ``views``, its row there in ``corners``, and that of its
+    ``point``.
     """
 
     points: FloatArray
@@ -184,7 +186,8 @@ class PlaceStructure:
     def _triangulated(self, views: Rows, corners: Rows, point: Rows, count: int) -> Tracks:
         """Points ``(count, 3)``, NaN where unknown, and the sightings that agree with them.
 
-        A sighting is of a ``point``, at a row of the ``corners`` of a place among the ``views``, ``(S,)`` each.
+        A sighting is of a ``point``, at a row of the ``corners`` of a place among the ``views``,
+        ``(S,)`` each.
         """
         intrinsics, allowed_px = self._places.intrinsics, self._thresholds.reprojection_px
         rays, focal = intrinsics.rays(self.pixels(views, corners)), (intrinsics.fx, intrinsics.fy)
@@ -205,7 +208,8 @@ def triangulate(
 ) -> tuple[FloatArray, FloatArray]:
     """Points ``(count, 3)`` closest to all their rays, and the widest angle between two of each point's rays, radians.
 
-    Least squares of the distances to the rays: ``sum (I - d d^T) (X - c) = 0``. NaN where rays are parallel.
+    Least squares of the distances to the rays: ``sum (I - d d^T) (X - c) = 0``. NaN where rays are
+    parallel.
 
     Args:
         T_camera_world: of each sighting ``(S, 4, 4)``.

@@ -52,7 +52,8 @@ class LoopThresholds:
 
 
 OF_FRAMES = LoopThresholds()
-# keyframes' points are exact within a map that drifts, their descriptors further apart in distance and roll
+# keyframes' points are exact within a map that drifts, their descriptors further apart in distance
+# and roll
 OF_KEYFRAMES = LoopThresholds(
     min_inliers=15,
     agreement_deg=4.0,
@@ -77,8 +78,9 @@ OF_KEYFRAMES = LoopThresholds(
 class Loop:
     """A verified loop; ``inliers`` is the smaller of both directions.
 
-    ``measured`` is in the unit of the earlier view, ``scale`` that of the later one in it. ``corners`` ``(M, 2)`` are
-    rows of corners of the earlier and of the later view that show one point, ``pixels`` ``(M, 2, 2)`` where they are.
+    ``measured`` is in the unit of the earlier view, ``scale`` that of the later one in it.
+    ``corners`` ``(M, 2)`` are rows of corners of the earlier and of the later view that show one
+    point, ``pixels`` ``(M, 2, 2)`` where they are.
     """
 
     measured: RelativePose
@@ -133,8 +135,8 @@ class LoopVerifier:
         """Measure the pose of the later view in the earlier one, or reject it with a reason.
 
         Args:
-            earlier: a view with points in its own camera, NaN where unknown.
-            later: the same, of the same camera or another one of the same intrinsics.
+            earlier: the earlier view, its points in its own camera, NaN where unknown.
+            later: the later view, likewise.
             score: similarity of both, which is kept with the verdict.
         """
         rows_earlier, rows_later = matches(earlier, later, self.thresholds)
@@ -218,7 +220,8 @@ class LoopVerifier:
     ) -> FloatArray:
         """Sigmas ``(6,)`` in camera b: of corners, of learned depth, and half the difference of both directions.
 
-        Both directions use the same corners, whose errors are correlated: averaging does not reduce the sigmas.
+        Both directions use the same corners, whose errors are correlated: averaging does not reduce
+        the sigmas.
         """
         corners = _CORNER_SIGMA_WIDENING * np.hypot(forward, backward)
         rotation = Rotation.from_matrix(difference[:3, :3]).as_rotvec()

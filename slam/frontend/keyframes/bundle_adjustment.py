@@ -1,8 +1,8 @@
 """Bundle adjustment: cameras and points that fit all sightings best, by Levenberg-Marquardt on the Schur complement.
 
-As in Triggs et al. 2000, section 6.1: the points are eliminated, the cameras' reduced system is solved, dense for a
-window and sparse for all keyframes of a map, the points follow. A camera is perturbed on the left,
-``Exp(xi) T_camera_world``, rotation first.
+As in Triggs et al. 2000, section 6.1: the points are eliminated, the cameras' reduced system is
+solved, dense for a window and sparse for all keyframes of a map, the points follow. A camera is
+perturbed on the left, ``Exp(xi) T_camera_world``, rotation first.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ _StepByDamping = Callable[[float], tuple[FloatArray, FloatArray] | None]
 class Sightings:
     """``S`` sightings of points by cameras, in their order: rows of both ``(S,)``, ``pixels`` ``(S, 2)``, ``depth``.
 
-    Depth ``(S,)`` is that in the camera by its prior, in a unit of this image, with ``depth_sigma`` of its logarithm
-    ``(S,)``; NaN for none. A point is seen at most once by a camera.
+    Depth ``(S,)`` is that in the camera by its prior, in a unit of this image, with ``depth_sigma``
+    of its logarithm ``(S,)``; NaN for none. A point is seen at most once by a camera.
     """
 
     camera: NDArray[np.int64]
@@ -169,7 +169,8 @@ class BundleAdjustment:
     def _relief(self, logarithms: FloatArray) -> FloatArray:
         """Residuals of depth ``(S,)`` without what those of an image have in common, which is Huber's location.
 
-        It is where an adjustment of the images' units would end, so that derivatives need not know it.
+        It is where an adjustment of the images' units would end, so that derivatives need not know
+        it.
         """
         whitened = np.zeros(len(logarithms))
         if not self._learned_rows:
@@ -227,8 +228,8 @@ class BundleAdjustment:
     ) -> _StepByDamping:
         """Steps of cameras ``(F, 6)`` and points ``(P, 3)`` by the damping, None where the system is singular.
 
-        Its parts are those of cameras ``U`` ``(F, 6, 6)`` and points ``V`` ``(P, 3, 3)``, their coupling ``W``
-        ``(6, 3, S)``, and the right sides.
+        Its parts are those of cameras ``U`` ``(F, 6, 6)`` and points ``V`` ``(P, 3, 3)``, their
+        coupling ``W`` ``(6, 3, S)``, and the right sides.
         """
         root = self.weights(residuals)
         by_camera, by_point = self.jacobians(T, X)

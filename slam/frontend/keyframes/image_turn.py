@@ -1,8 +1,9 @@
 """How the camera turned since the last image, by aligning small images: bare walls and windows show it without corners.
 
-Small images as PTAM aligns them (Klein and Murray 2008), over the three angles of a turn, with the gradients of the
-first image (Baker and Matthews 2004). Rows of a rolling shutter are read one after another while the camera turns:
-corners are moved to where one moment would show them, by a turn at a steady rate that moves the image as a whole.
+Small images as PTAM aligns them (Klein and Murray 2008), over the three angles of a turn, with the
+gradients of the first image (Baker and Matthews 2004). Rows of a rolling shutter are read one after
+another while the camera turns: corners are moved to where one moment would show them, by a turn at
+a steady rate that moves the image as a whole.
 """
 
 from __future__ import annotations

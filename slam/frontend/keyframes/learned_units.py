@@ -26,7 +26,8 @@ def learned_unit(local: LocalMap) -> float:
 def learned_units(local: LocalMap, carried: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Learned depth over depth in the map along it ``(K,)``, and over what each keyframe says of it ``(K,)``.
 
-    The logarithm of the unit is a random walk with sigmas ``carried`` ``(K - 1,)`` from each keyframe to the next.
+    The logarithm of the unit is a random walk with sigmas ``carried`` ``(K - 1,)`` from each
+    keyframe to the next.
     """
     own = np.full(len(local.keyframes), np.nan)
     for row, keyframe in enumerate(local.keyframes):
@@ -36,7 +37,8 @@ def learned_units(local: LocalMap, carried: FloatArray) -> tuple[FloatArray, Flo
             own[row] = -float(np.median(np.log(known)))
     if not np.isfinite(own).any():
         return np.ones(len(own)), np.ones(len(own))
-    # the scatter of the units of learned depth about that of the map, by keyframes that share no error
+    # the scatter of the units of learned depth about that of the map, by keyframes that share no
+    # error
     apart = own[_SHARED:] - own[:-_SHARED]
     apart = apart[np.isfinite(apart)]
     usual = _SIGMA

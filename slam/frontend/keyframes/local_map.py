@@ -1,8 +1,9 @@
 """Keyframes and the points they see: points from learned depth, found again, adjusted with the last keyframes.
 
-Learned depth says what depths of an image are to each other, nothing about the unit of the map: depths of one image fit
-each other much better than those of two images, for they share an unknown unit. What remains is still no independent
-error of each point, so that it weighs less where rays know a depth as well.
+Learned depth says what depths of an image are to each other, nothing about the unit of the map:
+depths of one image fit each other much better than those of two images, for they share an unknown
+unit. What remains is still no independent error of each point, so that it weighs less where rays
+know a depth as well.
 """
 
 from __future__ import annotations
@@ -30,17 +31,20 @@ _MATCHED = KEYFRAME_SEARCH._replace(levels=1)  # guesses are near
 _BORDER_PX = 8
 _LEAST_MATCHED = 8
 _SHARED = 5
-# a keyframe is near if its camera is within this of the median depth, and looks the same way up to this cosine
+# a keyframe is near if its camera is within this of the median depth, and looks the same way up to
+# this cosine
 _NEAR_DEPTHS = 0.5
 _NEAR_COSINE = 0.7
 _ALIGNED_PX = 2.0
 _PROJECTED_PX = 4.0
 _ALIGNED_KEYFRAMES = 4
-# a point that two keyframes do not find is hidden; after three keyframes that find hardly any, so are those that remain
+# a point that two keyframes do not find is hidden; after three keyframes that find hardly any, so
+# are those that remain
 _ATTEMPTS, _MISSES = 2, 3
 _LEAST_FOUND = 0.02
-# most iterations of a bundle adjustment, and the relative fall of the cost at which it ends: each keyframe is adjusted
-# ten times; but in a young map, depth and motion change together at hardly any cost
+# most iterations of a bundle adjustment, and the relative fall of the cost at which it ends: each
+# keyframe is adjusted ten times; but in a young map, depth and motion change together at hardly any
+# cost
 _LIMITS, _YOUNG_LIMITS = (6, 3e-3), (12, 1e-3)
 _YOUNG = 6  # keyframes of a young map
 OUTLIER_PX = 5.0  # residual of a sighting that is taken out, pixels
@@ -100,9 +104,9 @@ class Parallax:
 class TrackedKeyframe:
     """A frame whose corners are sightings: ``track_ids`` ``(M,)`` in order and their ``pixels`` ``(M, 2)``.
 
-    ``places`` ``(M, 2)`` are where its image has them: with a rolling shutter, pixels are as of the middle row.
-    ``learned_depth`` ``(M,)`` is positive, NaN where unknown, ``descriptors`` are ``(M, 32)``; ``grey`` is None once
-    the image is not kept any more.
+    ``places`` ``(M, 2)`` are where its image has them: with a rolling shutter, pixels are as of the
+    middle row. ``learned_depth`` ``(M,)`` is positive, NaN where unknown, ``descriptors`` are
+    ``(M, 32)``; ``grey`` is None once the image is not kept any more.
     """
 
     index: int
@@ -138,8 +142,9 @@ class TrackedKeyframe:
 class LocalMap:
     """One map, from its first keyframe to a loss; ``started`` once it has points.
 
-    ``keyframes`` and ``frames`` are in time order, ``points`` ``(N, 3)`` in the world by track, NaN where unknown.
-    ``turns`` are motions of the camera where no point carries the unit, in the unit of learned depth.
+    ``keyframes`` and ``frames`` are in time order, ``points`` ``(N, 3)`` in the world by track, NaN
+    where unknown. ``turns`` are motions of the camera where no point carries the unit, in the unit
+    of learned depth.
     """
 
     keyframes: list[TrackedKeyframe] = field(default_factory=list)
@@ -266,7 +271,8 @@ class LocalMap:
             outlier_px: residual of a sighting that is taken out, pixels.
 
         Returns:
-            Tracks whose sightings were taken out of each keyframe as outliers, and those that thereby lost their point.
+            Tracks whose sightings were taken out of each keyframe as outliers, and those that
+            thereby lost their point.
         """
         free = np.arange(len(chosen)) >= fixed
         poses = np.array([self.keyframes[k].T_camera_world for k in chosen])

@@ -67,7 +67,8 @@ _NOTHING: tuple[TrackIds, Pixels] = np.zeros(0, np.int64), np.zeros((0, 2), np.f
 class KeyframeOdometry:
     """Poses of the frames of one sequence in the unit of each segment's map.
 
-    ``segments`` are the maps so far, of which the last one grows with the frames; ``events`` tell what became of them.
+    ``segments`` are the maps so far, of which the last one grows with the frames; ``events`` tell
+    what became of them.
     """
 
     def __init__(
@@ -105,8 +106,8 @@ class KeyframeOdometry:
     def follow(self, frame: Frame) -> None:
         """Track and resect the next usable frame; make it a keyframe where that is wanted.
 
-        Where too few corners are tracked, the turn of the whole image leads to a keyframe of new corners. Depth of the
-        last keyframe has been learned, if it has any.
+        Where too few corners are tracked, the turn of the whole image leads to a keyframe of new
+        corners. Depth of the last keyframe has been learned, if it has any.
         """
         self._follow(frame)
         started = [segment for segment in self.segments if segment.started]

@@ -29,8 +29,9 @@ _ROTATION_SIGMA_DEG = 0.1  # least rotation sigma of a factor, degrees
 class KeyframePoses:
     """Relative ``poses`` and ``loops`` in the units of their maps.
 
-    ``segments`` is the number of the map of every frame that has a pose in one, ``learned_units`` the unit of learned
-    depth per unit of each map, by its number: of all maps alike, where they see one floor.
+    ``segments`` is the number of the map of every frame that has a pose in one, ``learned_units``
+    the unit of learned depth per unit of each map, by its number: of all maps alike, where they see
+    one floor.
     """
 
     poses: Sequence[RelativePose] = ()

@@ -37,8 +37,8 @@ class Relocaliser:
         """The pose with most inliers at one of the similar keyframes, and all points that confirm it; None with few.
 
         Returns:
-            ``T_camera_map``, the tracks ``(M,)`` of these points, each once, the pixels ``(M, 2)`` where the image sees
-            them, and the frame of the keyframe with most of them.
+            ``T_camera_map``, the tracks ``(M,)`` of these points, each once, the pixels ``(M, 2)``
+            where the image sees them, and the frame of the keyframe with most of them.
         """
         keyframes, rows, points = self._matched(image)
         best: Sighting | None = None

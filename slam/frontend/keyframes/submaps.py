@@ -1,7 +1,8 @@
 """Maps of keyframes cut into parts through each of which points carry one unit, and maps of one drive joined.
 
-A camera that turns on the spot sees new points with hardly any parallax. The map goes on with learned depth, whose unit
-may be a tenth off, and every point fits. So it is cut there, and each part has the unit of learned depth or the floor.
+A camera that turns on the spot sees new points with hardly any parallax. The map goes on with
+learned depth, whose unit may be a tenth off, and every point fits. So it is cut there, and each
+part has the unit of learned depth or the floor.
 
 Joined maps are brought into one world, tracks of the same corner made one, all keyframes adjusted.
 """
@@ -63,8 +64,8 @@ Shared = tuple[int, int, NDArray[np.intp]]
 def parts_of(segment: LocalMap, intrinsics: Intrinsics) -> list[LocalMap]:
     """The parts of a map in time order; the map itself where no part has enough keyframes.
 
-    Motions to keyframes and frames outside the parts, and to the next part, are ``turns`` of the part before, those
-    before the first part its own.
+    Motions to keyframes and frames outside the parts, and to the next part, are ``turns`` of the
+    part before, those before the first part its own.
     """
     neighbours = pairwise(segment.keyframes)
     shared = [len(np.intersect1d(a.track_ids, b.track_ids)) for a, b in neighbours]
@@ -172,8 +173,8 @@ def _turn(
 ) -> RelativePose:
     """From a keyframe to a later camera in the unit of learned depth.
 
-    Where no points lead there, but the whole image, it is a turn of unknown small length, whatever later adjustments
-    made of it: at most some way at the camera's ``pace`` by frame.
+    Where no points lead there, but the whole image, it is a turn of unknown small length, whatever
+    later adjustments made of it: at most some way at the camera's ``pace`` by frame.
     """
     T = keyframe.T_camera_world @ invert(T_camera_world)
     learned = keyframe.learned_depth[np.isfinite(keyframe.learned_depth)]
@@ -189,7 +190,8 @@ def _turn(
 def _sigmas(local: LocalMap, intrinsics: Intrinsics) -> FloatArray:
     """Sigmas of the logarithm of the unit as points carry it from each keyframe to the next ``(K - 1,)``.
 
-    A point carries it by its parallax between the first camera that saw it and those up to the earlier keyframe.
+    A point carries it by its parallax between the first camera that saw it and those up to the
+    earlier keyframe.
     """
     parallax = Parallax(local.points)
     pixel = _PIXEL_SIGMA / intrinsics.fx
@@ -220,7 +222,8 @@ def join(
         intrinsics: of all images.
 
     Returns:
-        The map, and for each of ``shared`` the ratio of its corners that the adjustment left in one point.
+        The map, and for each of ``shared`` the ratio of its corners that the adjustment left in one
+        point.
     """
     ends = np.cumsum([len(segment.keyframes) for segment in segments])[:-1]
     parts = zip(segments, np.split(T_world_camera, ends), np.split(scales, ends), strict=True)

@@ -64,7 +64,8 @@ class MotionHistory:
     def is_possible_speed(self, speed: float, seconds: float) -> bool | None:
         """Whether a car can have this speed after a step of so many seconds; None where speeds are unknown.
 
-        Lengths by learned depth have a relative error of their own, three sigmas of which are granted.
+        Lengths by learned depth have a relative error of their own, three sigmas of which are
+        granted.
         """
         if len(self.speeds) < _SPEEDS or not np.isfinite([*self.speeds, speed]).all():
             return None

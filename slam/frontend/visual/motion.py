@@ -22,10 +22,11 @@ _LEAST_RELATIVE_SIGMA = 1e-3
 class Motion:
     """A measured ``relative_pose``, its length by learned depth, unscaled.
 
-    Where corners alone gave rotation and direction, ``covariance`` ``(6, 6)`` is that of both in this order, in the
-    later camera, radians, and ``length_ratio`` is the log of the length over that of the step before, by points that
-    both triangulated, with its sigma; else None. ``seconds`` passed between the frames. ``support`` is the share of the
-    earlier frame's corners that were found again and fit the motion.
+    Where corners alone gave rotation and direction, ``covariance`` ``(6, 6)`` is that of both in
+    this order, in the later camera, radians, and ``length_ratio`` is the log of the length over
+    that of the step before, by points that both triangulated, with its sigma; else None.
+    ``seconds`` passed between the frames. ``support`` is the share of the earlier frame's corners
+    that were found again and fit the motion.
     """
 
     relative_pose: RelativePose
@@ -67,8 +68,10 @@ class Motion:
         Args:
             length: in any unit, that of the result.
             relative_sigma: of the length.
-            relative_correlated_sigma: of independent errors that add up along the steps as those of the lengths do.
-            noise: sigmas ``(6,)`` of rotation and direction, added in squares to those of the corners.
+            relative_correlated_sigma: of independent errors that add up along the steps as those of
+                the lengths do.
+            noise: sigmas ``(6,)`` of rotation and direction, added in squares to those of the
+                corners.
         """
         T_previous_current = self.relative_pose.T_from_to.copy()
         T_previous_current[:3, 3] *= length / self.length_unscaled
@@ -87,8 +90,8 @@ class Motion:
 class RelativeRotation:
     """The rotation from one frame to another some steps later, measured on these two images alone.
 
-    ``R_to_from`` ``(3, 3)`` takes points of the earlier camera to the axes of the later one; ``sigmas`` ``(3,)`` are
-    those of its rotation vector in the later camera, radians.
+    ``R_to_from`` ``(3, 3)`` takes points of the earlier camera to the axes of the later one;
+    ``sigmas`` ``(3,)`` are those of its rotation vector in the later camera, radians.
     """
 
     ends: Ends
@@ -101,7 +104,8 @@ def pose_sigmas(
 ) -> FloatArray:
     """Sigmas ``(6,)`` of a pose in the current camera, where GTSAM perturbs.
 
-    By those ``of_unit_pose`` ``(6,)``, its rotation and direction in radians, and by that of its length.
+    By those ``of_unit_pose`` ``(6,)``, its rotation and direction in radians, and by that of its
+    length.
     """
     along = np.abs(invert(T_previous_current)[:3, 3])
     length = float(np.linalg.norm(along))
@@ -111,7 +115,8 @@ def pose_sigmas(
     )
 
 
-# every motion that image geometry measured, kept once under its two frames, in the order in which they were measured
+# every motion that image geometry measured, kept once under its two frames, in the order in which
+# they were measured
 Steps = Mapping[Ends, Motion]
 
 

@@ -18,8 +18,8 @@ from slam.frontend.visual.motion import Motion, links
 from slam.geometry.robust import MAD_TO_SIGMA
 from slam.geometry.se3 import FloatArray, invert
 
-# sigmas over the jitter and over the residual, by Student's t on KITTI 00 and five simulated drives;
-# ratios of other drives cover no better (docs/design/noise-and-the-pose-graph.md)
+# sigmas over the jitter and over the residual, by Student's t on KITTI 00 and five simulated
+# drives; ratios of other drives cover no better (docs/design/noise-and-the-pose-graph.md)
 JITTER_ROTATION = 0.33
 JITTER_DIRECTION = 8.5
 NEIGHBOUR_ROTATION = 0.25
@@ -35,8 +35,8 @@ _NEIGHBOUR_RESIDUAL_OF_NOISE = 1.5
 def step_noise(motions: Mapping[Ends, Motion], frames: int) -> dict[Ends, FloatArray]:
     """The noise of each triangulated step of a drive besides that of the corners, which adds in squares.
 
-    Sigmas ``(6,)`` in radians are of rotation, then of the direction of the earlier camera as the later one sees it,
-    where GTSAM perturbs; along it there is no error.
+    Sigmas ``(6,)`` in radians are of rotation, then of the direction of the earlier camera as the
+    later one sees it, where GTSAM perturbs; along it there is no error.
 
     Args:
         motions: the triangulated steps; lengths are not used.
@@ -64,8 +64,9 @@ def step_noise(motions: Mapping[Ends, Motion], frames: int) -> dict[Ends, FloatA
 def rotation_jitter(rotations: FloatArray) -> FloatArray:
     """Sigmas ``(3,)``, radians, of the part of the steps' rotation vectors that no smooth motion explains.
 
-    Third differences remove any rotation that changes evenly; their median is robust to single jumps. Zero with few
-    steps. The vectors ``(S, 3)`` are in the order of the drive, NaN where unknown.
+    Third differences remove any rotation that changes evenly; their median is robust to single
+    jumps. Zero with few steps. The vectors ``(S, 3)`` are in the order of the drive, NaN where
+    unknown.
     """
     third = rotations[3:] - 3 * rotations[2:-1] + 3 * rotations[1:-2] - rotations[:-3]
     third = third[np.isfinite(third).all(axis=1)]
@@ -77,8 +78,8 @@ def rotation_jitter(rotations: FloatArray) -> FloatArray:
 def neighbour_residual(values: FloatArray) -> FloatArray:
     """Absolute residual ``(S, D)`` of each step's value to the prediction by its neighbours, 0 without neighbours.
 
-    Predicted by the two steps before, by the two after, and by one on each side; the median of these is robust
-    to one bad neighbour. Values are in the order of the drive, NaN where unknown.
+    Predicted by the two steps before, by the two after, and by one on each side; the median of
+    these is robust to one bad neighbour. Values are in the order of the drive, NaN where unknown.
     """
     padded = np.pad(values, ((2, 2), (0, 0)), constant_values=np.nan)
     earlier, before = padded[:-4], padded[1:-3]

@@ -29,7 +29,7 @@ from slam.frames import Intrinsics, Sequence
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.loops.places import Places, PlaceStructure
-from slam.loops.recognition import OF_KEYFRAMES
+from slam.loops.verification import OF_KEYFRAMES
 from slam.mapping.submap import moved_rows
 from slam.results.folder import RunFolder, check_replaced
 from slam.results.metrics import CAMERA_HEIGHTS, METRES

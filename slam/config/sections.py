@@ -121,7 +121,7 @@ class KeyframesConfig(Section):
 
 
 class GapsConfig(Section):
-    """Gap interpolation over unusable frames, see ``frontend/completion.py`` and ``frontend/image_gate.py``."""
+    """Gap interpolation over unusable frames, see ``frontend/gaps.py`` and ``frontend/image_gate.py``."""
 
     enabled: bool = Field(
         default=True,

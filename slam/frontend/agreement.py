@@ -1,6 +1,7 @@
 """How far a source of lengths, poses or depth contradicts the images' own motion, by robust statistics.
 
-Also how far the images of a drive are from those of good drives, and the confidence that follows from both.
+Also how far the images of a drive are from those of good drives, and the confidence that follows
+from both.
 """
 
 from __future__ import annotations
@@ -34,16 +35,12 @@ _TELLING_FOCAL = 0.1  # largest sigma of one that says something
 _USUAL_SUPPORT, _SUPPORT_SPREAD = 0.6, 0.13
 _WEAK_SUPPORT, _LEAST_WEAK = 0.2, 10  # and frames in a row that are a doubt
 _ON_ROAD, _ON_ROAD_SPREAD = 1.0, 0.2
-_FAR_SPREAD, _FAR_CORNERS = (
-    0.18,
-    0.05,
-)  # of the logarithm; and least corners over the most of a distance
+_FAR_SPREAD = 0.18  # of the logarithm
+_FAR_CORNERS = 0.05  # least corners over the most of a distance
 _CONTRADICTED_SPREAD = 0.007
-_LEAST_MOVED, _ALONG, _ASIDE_SPREAD = (
-    0.1,
-    np.cos(np.deg2rad(20.0)),
-    0.01,
-)  # of long steps; of their directions
+_LEAST_MOVED = 0.1  # of long steps
+_ALONG = np.cos(np.deg2rad(20.0))  # of the directions of steps
+_ASIDE_SPREAD = 0.01
 _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS = 0.03, 3.0
 # of `share_right`, by tools/fit_confidence.py of commit 669cc2b1
 CONFIDENCE = (0.97, 3.0, 5.5)
@@ -79,14 +76,25 @@ class Agreement:
         return self
 
     def required(self) -> Agreement:
-        """As `said`, of a source that the run has to take; ``SlamError`` where it is wrong."""
+        """As `said`, of a source that the run has to take.
+
+        Raises:
+            SlamError: the source is wrong.
+        """
         if self.is_wrong:
             raise SlamError(f"{self}; check its files and settings, or run without it")
         return self.said()
 
 
 def of_height(source: str, implied_m: float, stated_m: float | None, spread: float) -> Agreement:
-    """By the camera's height above the road that lengths of the source imply, with the relative spread of the road."""
+    """By the camera's height above the road.
+
+    Args:
+        source: its name in a sentence.
+        implied_m: the height that lengths of the source imply, metres.
+        stated_m: the height that the user or the data set states, metres; None where nobody does.
+        spread: relative sigma of the road that the images show.
+    """
     wanted, noise = (
         (_USUAL_HEIGHT_M, np.log(_USUAL_FACTOR)) if stated_m is None else (stated_m, _HEIGHT)
     )
@@ -100,24 +108,29 @@ def of_height(source: str, implied_m: float, stated_m: float | None, spread: flo
 def of_steps(
     source: str, steps: Sequence[RelativePose], motions: Mapping[Ends, Motion]
 ) -> Agreement | None:
-    """By rotations and directions of the steps that both measured; None where these are few."""
-    pairs = [
-        (step, motions[step.ends].relative_pose.T_from_to) for step in steps if step.ends in motions
-    ]
-    if len(pairs) < _LEAST:
+    """By rotations and directions of the steps that both measured.
+
+    Args:
+        source: its name in a sentence.
+        steps: as the source measured them, in any unit.
+        motions: as the images measured them, by their frames.
+
+    Returns:
+        None where fewer than five steps were measured by both.
+    """
+    both = [step for step in steps if step.ends in motions]
+    if len(both) < _LEAST:
         return None
-    by_source, by_images = (
-        np.array([step.T_from_to for step, _ in pairs]),
-        np.array([T for _, T in pairs]),
-    )
-    noise = np.array([step.sigmas for step, _ in pairs])
+    by_source = np.array([step.T_from_to for step in both])
+    by_images = np.array([motions[step.ends].relative_pose.T_from_to for step in both])
+    noise = np.array([step.sigmas for step in both])
     turned = rotation_angle((invert(by_source) @ by_images)[:, :3, :3])
-    lengths = [np.linalg.norm(T[:, :3, 3], axis=1) for T in (by_source, by_images)]
-    along = np.einsum("ni,ni->n", by_source[:, :3, 3], by_images[:, :3, 3]) / np.maximum(
-        lengths[0] * lengths[1], 1e-12
-    )
+    length_source = np.linalg.norm(by_source[:, :3, 3], axis=1)
+    length_images = np.linalg.norm(by_images[:, :3, 3], axis=1)
+    along = np.einsum("ni,ni->n", by_source[:, :3, 3], by_images[:, :3, 3])
+    along /= np.maximum(length_source * length_images, 1e-12)
     apart = np.arccos(np.clip(along, -1, 1))
-    of_direction = np.hypot(_DIRECTION_RAD, np.arctan2(noise[:, 3:].max(axis=1), lengths[0]))
+    of_direction = np.hypot(_DIRECTION_RAD, np.arctan2(noise[:, 3:].max(axis=1), length_source))
     sigmas = max(
         float(np.median(turned / np.hypot(_ROTATION_RAD, np.linalg.norm(noise[:, :3], axis=1)))),
         float(np.median(apart / of_direction)),
@@ -133,7 +146,14 @@ def of_steps(
 def of_positions(
     source: str, distances: FloatArray, sigmas: FloatArray, path_m: float
 ) -> Agreement:
-    """By distances ``(M,)`` of the aligned path from its positions with ``sigmas`` ``(M,)``, metres."""
+    """By the distances of the aligned path from positions of the source.
+
+    Args:
+        source: its name in a sentence.
+        distances: ``(M,)``, metres.
+        sigmas: of the positions ``(M,)``, metres.
+        path_m: length of the path, of which an alignment keeps a small part as drift.
+    """
     noise = np.hypot(sigmas, _DRIFT * path_m)
     median = float(np.median(distances))
     return Agreement(
@@ -176,45 +196,44 @@ def of_images(
         contradicted: steps whose length learned depth or the speed before contradicts.
         needs_road: whether lengths are measured on the road.
     """
-    frames, interpolated, guessed = len(drive), len(drive.interpolated), len(drive.segments) - 1
-    steps = (
-        0 if drive.maps else len(triangulated(drive.steps))
-    )  # lengths are then those of the maps
+    agreements: list[Agreement] = []
+
+    def compared(source: str, sigmas: float, figure: str) -> None:
+        agreements.append(Agreement(source, sigmas, figure, "good drives"))
+
+    frames = len(drive)
+    interpolated = len(drive.interpolated)
+    guessed = len(drive.segments) - 1
+    # with maps of keyframes, lengths are those of the maps
+    steps = 0 if drive.maps else len(triangulated(drive.steps))
     on_road = len(drive.road_steps)
     gaps = float(np.hypot(interpolated / frames / _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS * guessed))
     figure = f"{interpolated} of {frames} frames are interpolated"
     figure += f", the places of {guessed} segments guessed" if guessed else ""
-    found = [("gaps", gaps, figure)]
+    compared("gaps", gaps, figure)
     if steps:
         figure = f"learned depth or the speed before contradict {len(contradicted)} of {steps}"
-        figure += (
-            f", which end at frames {named([last for _, last in contradicted])}"
-            if contradicted
-            else ""
-        )
-        found.append(
-            ("the length of steps", len(contradicted) / steps / _CONTRADICTED_SPREAD, figure)
-        )
+        if contradicted:
+            figure += f", which end at frames {named([last for _, last in contradicted])}"
+        sigmas = len(contradicted) / steps / _CONTRADICTED_SPREAD
+        compared("the length of steps", sigmas, figure)
     corners_were_asked = bool(drive.motions or drive.failures)
     if corners_were_asked and (support := drive.support) is not None:
-        found.append(("the overlap of images", *_overlap(support)))
+        compared("the overlap of images", *_overlap(support))
     if needs_road and steps >= _LEAST:
         sigmas = (_ON_ROAD - on_road / steps) / _ON_ROAD_SPREAD
         figure = f"{on_road} of {steps} lengths were measured on the road; the others follow from learned depth"
-        found.append(("the view of the road", sigmas, figure))
+        compared("the view of the road", sigmas, figure)
     too_far = drive.depth_error.most_too_far(_FAR_CORNERS)
     if needs_road and steps and too_far is not None:
         figure = f"it is up to {100 * np.expm1(too_far):.0f} % farther than triangulated, as where a lens zooms"
-        found.append(("learned depth far away", too_far / _FAR_SPREAD, figure))
-    agreements = [
-        Agreement(source, sigmas, figure, "good drives") for source, sigmas, figure in found
-    ]
+        compared("learned depth far away", too_far / _FAR_SPREAD, figure)
     by_corners = of_focal_length(drive.focal_length, camera)
-    agreements += [] if by_corners is None else [by_corners]
-    return [
-        agreements[0],
-        *(each.said() for each in agreements[1:]),
-    ]  # gaps and segments were said by their frames
+    if by_corners is not None:
+        agreements.append(by_corners)
+    for each in agreements[1:]:  # gaps and segments were said by their frames
+        each.said()
+    return agreements
 
 
 def _overlap(support: FloatArray) -> tuple[float, str]:
@@ -248,7 +267,16 @@ def of_focal_length(found: FocalLength, camera: Intrinsics) -> Agreement | None:
 def confidence(
     agreements: Iterable[Agreement], is_metric: bool, is_carried: bool
 ) -> float | Failed:
-    """The share of drives with as large a contradiction that err by at most 1 % of their path; where known of such."""
+    """The share of drives with as large a contradiction that err by at most 1 % of their path.
+
+    Args:
+        agreements: of all sources of the drive.
+        is_metric: whether lengths are in metres.
+        is_carried: whether a person carries the camera.
+
+    Returns:
+        A failure for drives of which it is not known.
+    """
     if is_carried:
         return Failed("it is calibrated on roads, not for a camera that is carried")
     if not is_metric:

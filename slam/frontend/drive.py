@@ -94,18 +94,21 @@ class Drive:
     """Measurements of a drive in the networks' unit of length.
 
     Collected frame by frame, each list and dictionary growing at its end:
-        ``motions`` are all steps that image geometry measured, ``road_steps`` the lengths by the road's homography,
-        ``relative_rotations`` the rotations across several steps; ``failures`` are unmeasured steps with the reason.
-        ``roads`` has one entry a frame, the camera's height over the ground plane. ``unusable`` are frames without a
-        measurement, with the reason, ``repeated`` frames with the image of the one before, ``moving`` those of them
-        just before which the camera moved. ``depth_error`` is that of learned depth and ``focal_length`` the one that
-        corners show, as the steps have them. ``maps`` are those of keyframes and ``events`` what became of them; a
-        drive measured by steps alone has none.
+        ``motions`` are all steps that image geometry measured, ``road_steps`` the lengths by the
+        road's homography, ``relative_rotations`` the rotations across several steps; ``failures``
+        are unmeasured steps with the reason. ``roads`` has one entry a frame, the camera's height
+        over the ground plane. ``unusable`` are frames without a measurement, with the reason,
+        ``repeated`` frames with the image of the one before, ``moving`` those of them just before
+        which the camera moved. ``depth_error`` is that of learned depth and ``focal_length`` the
+        one that corners show, as the steps have them. ``maps`` are those of keyframes and
+        ``events`` what became of them; a drive measured by steps alone has none.
 
-    Added by `slam.frontend.completion.complete_drive`, which also leaves out views and keyframes of interpolated
-    frames, fills ``snippets`` to one a target, and smooths the rotations of ``motions``:
-        ``trusted`` are the snippets that the network measured on usable frames, ``interpolated`` the frames of gaps
-        with the reason, ``gap_steps`` their steps, ``map_poses`` the poses by the maps.
+    Added by `slam.frontend.completion.complete_drive`, which also leaves out views and keyframes of
+    interpolated frames, fills ``snippets`` to one a target, and smooths the rotations of
+    ``motions``:
+        ``trusted`` are the snippets that the network measured on usable frames, ``interpolated``
+        the frames of gaps with the reason, ``gap_steps`` their steps, ``map_poses`` the poses by
+        the maps.
     """
 
     snippets: list[SnippetPoses] = field(default_factory=list)
@@ -146,12 +149,11 @@ class Drive:
         More in a row are a camera that stands. At the end of a drive nobody knows.
         """
         moving = set(self.moving).difference(self.interpolated)
-        few = [
-            (first, last)
-            for first, last in runs(self.repeated)
-            if last - first < 2 and last < len(self) - 1
-        ]
-        return [k for first, last in few for k in range(first, last + 1) if k in moving]
+        found: list[int] = []
+        for first, last in runs(self.repeated):
+            if last - first < 2 and last < len(self) - 1:
+                found += sorted(moving.intersection(range(first, last + 1)))
+        return found
 
     @property
     def support(self) -> FloatArray | None:
@@ -181,41 +183,29 @@ class Drive:
             """The items that begin in the window, of items in order of time that may span a few frames."""
             return list(takewhile(lambda item: start(item) >= first, items))[::-1]
 
-        def moved(motion: Motion) -> Motion:
-            pose, (a, b) = motion.relative_pose, motion.ends
-            return replace(
-                motion, relative_pose=replace(pose, from_index=a - first, to_index=b - first)
-            )
+        def renumbered(ends: Ends) -> Ends:
+            return ends[0] - first, ends[1] - first
 
-        return Drive(
-            snippets=[
-                replace(
-                    s,
-                    target=s.target - first,
-                    sources=tuple(source - first for source in s.sources),
-                )
-                for s in last(reversed(self.snippets), lambda s: min(s.sources))
-            ],
-            motions=[moved(motion) for motion in last(reversed(self.motions), lambda m: m.ends[0])],
-            road_steps={
-                (ends[0] - first, ends[1] - first): step
-                for ends, step in last(reversed(self.road_steps.items()), lambda item: item[0][0])
-            },
-            relative_rotations=[
-                replace(rotation, ends=(rotation.ends[0] - first, rotation.ends[1] - first))
-                for rotation in last(reversed(self.relative_rotations), lambda r: r.ends[0])
-            ],
-            failures=[
-                (a - first, b - first, why)
-                for a, b, why in last(reversed(self.failures), lambda f: f[0])
-            ],
-            roads=self.roads[first:],
-            unusable={
-                k - first: why
-                for k, why in last(reversed(self.unusable.items()), lambda item: item[0])
-            },
-            repeated=[k - first for k in last(reversed(self.repeated), lambda k: k)],
-        )
+        window = Drive(roads=self.roads[first:])
+        for snippet in last(reversed(self.snippets), lambda snippet: min(snippet.sources)):
+            target = snippet.target - first
+            sources = tuple(source - first for source in snippet.sources)
+            window.snippets.append(replace(snippet, target=target, sources=sources))
+        for motion in last(reversed(self.motions), lambda motion: motion.ends[0]):
+            from_index, to_index = renumbered(motion.ends)
+            pose = replace(motion.relative_pose, from_index=from_index, to_index=to_index)
+            window.motions.append(replace(motion, relative_pose=pose))
+        for ends, step in last(reversed(self.road_steps.items()), lambda item: item[0][0]):
+            window.road_steps[renumbered(ends)] = step
+        for turn in last(reversed(self.relative_rotations), lambda turn: turn.ends[0]):
+            window.relative_rotations.append(replace(turn, ends=renumbered(turn.ends)))
+        for earlier, later, why in last(reversed(self.failures), lambda failure: failure[0]):
+            window.failures.append((*renumbered((earlier, later)), why))
+        for frame, why in last(reversed(self.unusable.items()), lambda item: item[0]):
+            window.unusable[frame - first] = why
+        for frame in last(reversed(self.repeated), lambda frame: frame):
+            window.repeated.append(frame - first)
+        return window
 
 
 def frame_support(frames: range, motions: Iterable[Motion]) -> FloatArray:

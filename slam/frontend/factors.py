@@ -1,7 +1,8 @@
 """All relative-pose factors of a run, made once from all measurements, and the odometry chained from them.
 
-The pose network's lengths have a unit of their own, which is not that of learned depth and changes with the street.
-Both it and the network's noise are measured against the steps of image geometry (``docs/design/learned-priors.md``).
+The pose network's lengths have a unit of their own, which is not that of learned depth and changes
+with the street. Both it and the network's noise are measured against the steps of image geometry
+(``docs/design/learned-priors.md``).
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from slam.frames import KEYFRAME_SOURCE, RelativePose, SnippetPoses, runs
 from slam.frontend.drive import Drive
 from slam.frontend.keyframes.relative_poses import KeyframePoses, chained
 from slam.frontend.scale import Scale
-from slam.frontend.visual.motion import step_noise, triangulated
+from slam.frontend.visual.motion import triangulated
+from slam.frontend.visual.noise import step_noise
 from slam.geometry.robust import MAD_TO_SIGMA, running_median
 from slam.geometry.se3 import (
     FloatArray,
@@ -35,15 +37,14 @@ from slam.geometry.se3 import (
 logger = logging.getLogger(__name__)
 NETWORK_SOURCE = "network"
 STUDENT_T_DOF = 12.0  # of the errors of measured steps: degrees of freedom of Student's t
-LEAST_PAIRS = (
-    20  # steps that image geometry measured too, from which on unit and noise are measured
-)
+# steps that image geometry measured too, from which on unit and noise are measured
+LEAST_PAIRS = 20
 _NEAREST_PAIRS = 40  # in time, by which they are measured
 _LONGEST_PAIR = 4  # frames: as far as a snippet reaches
 _SHORTEST_PAIR = 0.1  # over the median length of a step: shorter ones say nothing about the unit
 _CORRELATED_STEPS = 50  # over which errors are taken as equal
-# of a step whose noise is not measured: radians, and over its length in the unit of learned depth, from which that of
-# the network differs by so much from drive to drive
+# of a step whose noise is not measured: radians, and over its length in the unit of learned depth,
+# from which that of the network differs by so much from drive to drive
 _USUAL_SIGMAS = np.repeat([np.deg2rad(0.3), 0.3], 3)
 _LEAST_SIGMAS = np.repeat([np.deg2rad(0.03), 0.02], 3)
 
@@ -53,8 +54,14 @@ def make_factors(
 ) -> list[RelativePose]:
     """All relative poses of a completed drive with their noise, in the unit of the scale.
 
-    The least certain come first, and odometry is chained by the last ones; steps by LiDAR, in metres, stand before
-    those of image geometry. What the pose network measured is a line in the log of this ``level``.
+    The least certain come first, and odometry is chained by the last ones; steps by LiDAR stand
+    before those of image geometry.
+
+    Args:
+        drive: completed.
+        scale: of that drive.
+        lidar_steps: steps by LiDAR, metres.
+        level: of the line in the log that says what the pose network measured.
     """
     maps = drive.map_poses
     geometric = []
@@ -74,15 +81,18 @@ def make_factors(
     if not calibration.is_measured:  # lengths in the wrong unit have no say beside measured ones
         by_geometry = {pose.ends for pose in geometric}
         networks = [factor for factor in networks if factor.ends not in by_geometry]
-    interpolated = [scale.scaled(pose) for pose in drive.gap_steps]
-    by_network, interpolated, by_image = (
-        [pose for pose in poses if not maps.is_inside(pose)]
-        for poses in (networks, interpolated, geometric)
-    )
+    by_network = _outside(maps, networks)
+    by_image = _outside(maps, geometric)
+    interpolated = _outside(maps, [scale.scaled(pose) for pose in drive.gap_steps])
     interpolated = join_gap_ends(
         interpolated, [*by_network, *by_image], by_keyframes, maps.segments
     )
     return [*by_network, *interpolated, *lidar_steps, *by_image, *by_keyframes]
+
+
+def _outside(maps: KeyframePoses, poses: Sequence[RelativePose]) -> list[RelativePose]:
+    """The poses between frames that do not both lie in one connected component of maps."""
+    return [pose for pose in poses if not maps.is_inside(pose)]
 
 
 def scaled_poses(
@@ -100,8 +110,8 @@ def chain_odometry(factors: Sequence[RelativePose], count: int) -> FloatArray:
     """Odometry without a graph ``(count, 4, 4)``: each frame by the best factor that ends there.
 
     Args:
-        factors: in one unit, from earlier to later frames; one at least ends at every frame but the first. Of several
-            that are equally good and long, the last one is taken.
+        factors: in one unit, from earlier to later frames; one at least ends at every frame but the
+            first. Of several that are equally good and long, the last one is taken.
         count: frames.
     """
     arriving: dict[int, RelativePose] = {}
@@ -129,8 +139,10 @@ class NetworkCalibration:
 
     Attributes:
         unit: ``(N,)``, length per unscaled length of the step.
-        sigmas: ``(N, 6)`` of the step, rotation in radians, then translation over the usual length of a step.
-        pairs: steps that image geometry measured too; with fewer than 20 of them the unit is that of learned depth.
+        sigmas: ``(N, 6)`` of the step, rotation in radians, then translation over the usual length
+            of a step.
+        pairs: steps that image geometry measured too; with fewer than 20 of them the unit is that
+            of learned depth.
     """
 
     unit: FloatArray
@@ -149,10 +161,8 @@ class NetworkCalibration:
                 f"fewer than {LEAST_PAIRS} steps measure its unit, that of learned depth is taken"
             )
         least, usual, most = np.quantile(self.unit / depth_unit, (0.0, 0.5, 1.0))
-        rotation, translation = (
-            np.rad2deg(np.median(self.sigmas[:, :3])),
-            np.median(self.sigmas[:, 5]),
-        )
+        rotation = np.rad2deg(np.median(self.sigmas[:, :3]))
+        translation = np.median(self.sigmas[:, 5])
         return (
             f"by {self.pairs} steps its unit is {usual:.2f} ({least:.2f} to {most:.2f}) of that of learned depth, and "
             f"its noise {rotation:.2f} degrees and {100 * translation:.0f} % of a step"
@@ -160,9 +170,10 @@ class NetworkCalibration:
 
     def scaled(self, steps: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
         """Steps ``T_k_next`` by k in the unit."""
-        scaled = {k: T_k_next.copy() for k, T_k_next in steps.items()}
-        for k, T_k_next in scaled.items():
-            T_k_next[:3, 3] *= self.unit[k]
+        scaled = {}
+        for k, T_k_next in steps.items():
+            scaled[k] = T_k_next.copy()
+            scaled[k][:3, 3] *= self.unit[k]
         return scaled
 
 
@@ -181,19 +192,28 @@ def calibrate_network(
 ) -> NetworkCalibration:
     """The unit and the noise of the network's steps, by the poses that image geometry measured too.
 
-    At a frame, they are medians over the pairs nearest in time. With fewer than 20 pairs, lengths are in the unit of
-    learned depth, and accordingly uncertain. Steps ``T_k_next`` are unscaled; ``depth_unit`` ``(N,)`` is the unit of
-    the ``geometric`` poses per unit of learned depth at each frame.
+    At a frame, they are medians over the pairs nearest in time. With fewer than 20 pairs, lengths
+    are in the unit of learned depth, and accordingly uncertain.
+
+    Args:
+        steps: ``T_k_next`` by k, unscaled.
+        geometric: poses by image geometry, also across several frames.
+        depth_unit: unit of these poses per unit of learned depth at each frame ``(N,)``.
     """
-    measured = (p for p in geometric if 0 < p.to_index - p.from_index <= _LONGEST_PAIR)
-    pairs = [p for p in measured if steps.keys() >= set(range(*p.ends))]
+    pairs, by_network = [], []
+    for pose in geometric:
+        between = range(*pose.ends)
+        if 0 < len(between) <= _LONGEST_PAIR and steps.keys() >= set(between):
+            pairs.append(pose)
+            by_network.append(reduce(np.matmul, (steps[k] for k in between)))
     if len(pairs) < LEAST_PAIRS:
         return _by_depth(depth_unit, len(pairs))
-    first, last = np.array([p.ends for p in pairs]).T
-    T_network = np.array([reduce(np.matmul, (steps[k] for k in range(*p.ends))) for p in pairs])
-    T_geometric = np.array([p.T_from_to for p in pairs])
+    first, last = np.array([pose.ends for pose in pairs]).T
+    T_network = np.array(by_network)
+    T_geometric = np.array([pose.T_from_to for pose in pairs])
     t_network, t_geometric = T_network[:, :3, 3], T_geometric[:, :3, 3]
-    length, frames = np.linalg.norm(t_geometric, axis=1), last - first
+    length = np.linalg.norm(t_geometric, axis=1)
+    frames = last - first
     # along the measured motion, where the network's noise has no bias, as it has in the length
     ratio = (t_network * t_geometric).sum(axis=1) / np.maximum(length, 1e-12) ** 2
     used = (ratio > 0) & (length > _SHORTEST_PAIR * np.median(length / frames) * frames)
@@ -204,10 +224,9 @@ def calibrate_network(
     reach = np.where(np.arange(6) < 3, frames[:, None], length[:, None])
     error = np.abs(tangent(invert(T_network[used]) @ T_geometric[used])) / reach[used]
     # the unit follows image geometry, and so shares its errors
-    shared = np.array([p.sigmas for p in pairs])[used] / reach[used]
-    own, of_geometry = (
-        _nearest_median(first[used], values, len(unit)) for values in (error, shared)
-    )
+    shared = np.array([pose.sigmas for pose in pairs])[used] / reach[used]
+    own = _nearest_median(first[used], error, len(unit))
+    of_geometry = _nearest_median(first[used], shared, len(unit))
     sigmas = np.hypot(MAD_TO_SIGMA * own, of_geometry)
     return NetworkCalibration(unit, np.maximum(sigmas, _LEAST_SIGMAS), int(used.sum()))
 
@@ -220,7 +239,8 @@ def network_factors(
         return []
     scaled = calibration.scaled(steps)
     lengths = np.array([np.linalg.norm(T_k_next[:3, 3]) for T_k_next in scaled.values()])
-    # sigmas by its own length would give a step that came out short more weight, and a drive that is too short
+    # sigmas by its own length would give a step that came out short more weight, and a drive that
+    # is too short
     usual = running_median(lengths, _NEAREST_PAIRS + 1)
     reach = np.maximum(usual, _SHORTEST_PAIR * np.median(lengths)).clip(1e-9)
     # with nothing beside them, the usual sigmas are wide enough by themselves
@@ -239,15 +259,17 @@ def network_factors(
 def chain_raw(snippets: Sequence[SnippetPoses], count: int) -> FloatArray:
     """The network trajectory: target to next source of each snippet, without a graph.
 
-    Frames before the first target and after the last come from the direct poses of these two snippets. There is one a
-    target, in time order without gaps.
+    Frames before the first target and after the last come from the direct poses of these two
+    snippets. There is one a target, in time order without gaps.
 
     Returns:
         ``T_world_camera`` ``(count, 4, 4)``, unscaled, the first the identity.
     """
     steps: dict[int, FloatArray] = {}
     for snippet in snippets:
-        steps |= {k: T for k, T in _steps(snippet).items() if k == snippet.target or k not in steps}
+        for k, T_k_next in _steps(snippet).items():
+            if k == snippet.target or k not in steps:
+                steps[k] = T_k_next
     return chain(np.array([steps[k] for k in range(count - 1)]))
 
 
@@ -286,7 +308,8 @@ def join_gap_ends(
 ) -> list[RelativePose]:
     """The interpolated steps. Equal steps across a gap replace the steps in the gap if one map has both sides.
 
-    Constant velocity is a poor guess over a long gap, and many such steps would outvote the one pose by the map.
+    Constant velocity is a poor guess over a long gap, and many such steps would outvote the one
+    pose by the map.
 
     Args:
         interpolated: steps without a measurement, in one unit with all others.
@@ -296,10 +319,12 @@ def join_gap_ends(
     """
     T_map_camera = chained(by_map)
     loose = {pose.from_index: pose for pose in interpolated}
-    T_step = {
-        pose.from_index: pose.T_from_to for pose in measured if pose.to_index == pose.from_index + 1
-    }
-    T_step |= {first: pose.T_from_to for first, pose in loose.items()}
+    T_step = {}
+    for pose in measured:
+        if pose.to_index == pose.from_index + 1:
+            T_step[pose.from_index] = pose.T_from_to
+    for pose in interpolated:
+        T_step[pose.from_index] = pose.T_from_to
     for first, last in pairwise(sorted(maps)):
         steps = range(first, last)
         if (

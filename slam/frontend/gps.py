@@ -1,7 +1,7 @@
 """GPS beside the camera: its local frame east, north, up on the ellipsoid of WGS 84, the scale, places for the graph.
 
-Fixes of a receiver share most of their error for seconds to minutes. So their sigmas are widened as if only one fix in
-``correlation_s`` were independent.
+Fixes of a receiver share most of their error for seconds to minutes. So their sigmas are widened as
+if only one fix in ``correlation_s`` were independent.
 """
 
 from __future__ import annotations
@@ -57,7 +57,8 @@ class GpsFixes:
         """The fixes of a track between the first and the last of the frames' stamps ``(N,)``.
 
         Raises:
-            SlamError: lengths are not in metres, or fewer than three fixes were taken during the drive.
+            SlamError: lengths are not in metres, or fewer than three fixes were taken during the
+                drive.
         """
         if mode == "none":
             raise SlamError(
@@ -84,9 +85,9 @@ class GpsFixes:
     def scale(self, T_world_camera_unscaled: FloatArray) -> ScaleEstimate | Failed:
         """Metres per unit of an odometry ``(N, 4, 4)``: the median ratio of chords, so that outliers count little.
 
-        Errors of fixes lengthen a chord by about their variance over its length. So chords are a tenth of the fixes, or
-        several of them where these span less than 20 sigmas, and are chosen by the camera's lengths: choosing by GPS
-        would prefer chords that errors lengthen.
+        Errors of fixes lengthen a chord by about their variance over its length. So chords are a
+        tenth of the fixes, or several of them where these span less than 20 sigmas, and are chosen
+        by the camera's lengths: choosing by GPS would prefer chords that errors lengthen.
         """
         estimated = self._camera(T_world_camera_unscaled)
         sigma = float(np.median(self.sigmas[:, 0]))

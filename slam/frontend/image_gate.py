@@ -19,22 +19,24 @@ from slam.runtime.errors import Failed
 _THUMBNAIL = (32, 16)  # width, height
 _SHRINKING = 4  # averages out compression noise
 _LEAST_GRADIENT = 1e-3
-# an image is frozen if the motion before it was larger than this times the usual difference of a copy
+# an image is frozen if the motion before it was larger than this times the usual difference of a
+# copy
 _MOVING = 3.0
-# copies of dark or blurred images differ by more: up to this ratio of the motion before, and twice the usual difference
+# copies of dark or blurred images differ by more: up to this ratio of the motion before, and twice
+# the usual difference
 _COPY_OVER_MOTION = 0.25
 _LARGEST_COPY = 2.0
 # of the median grey level from an image to the next, in logarithms
 _EXPOSURE_STEP = 0.1
 _BLANK_CONTRAST = 3.0  # standard deviation of grey levels below which a frame is blank
 _NOISE_CONTRAST = 0.3  # contrast after blurring over contrast before, below which a frame is noise
-# pixels stand whose grey level changes by less in the mean, and that of half of the image by much more
+# pixels stand whose grey level changes by less in the mean, and that of half of the image by much
+# more
 _STANDING_GREY, _MOVING_GREY = 0.7, 4.0
 _BRIGHT_GREY = 235.0  # the sky does not change where the camera sees white
 _STANDING_IMAGES, _REMEMBERED_IMAGES = 20, 50
-_REPEAT_DIFFERENCE = (
-    0.1  # largest difference of a re-encoded copy to its image, over the mean image gradient
-)
+# largest difference of a re-encoded copy to its image, over the mean image gradient
+_REPEAT_DIFFERENCE = 0.1
 
 Verdict = Literal["new", "repeated"] | Failed
 _Layer = NDArray[np.float32]
@@ -43,8 +45,8 @@ _Layer = NDArray[np.float32]
 class ImageGate:
     """Classifies the images of one sequence in time order.
 
-    Of all ``compared`` images, ``exposed`` are much brighter or darker than the one before. Those pixels are
-    ``standing`` ``(h, w)`` that do not move with the others; None where there are none.
+    Of all ``compared`` images, ``exposed`` are much brighter or darker than the one before. Those
+    pixels are ``standing`` ``(h, w)`` that do not move with the others; None where there are none.
     """
 
     def __init__(self) -> None:
@@ -86,7 +88,8 @@ class ImageGate:
     def _compared(self, shrunk: _Layer) -> Verdict:
         """Compare an image with the last new one: its exposure, and whether it is a re-encoded copy of it.
 
-        A copy is frozen where the camera moved just before: a camera that comes to a stop slows down first.
+        A copy is frozen where the camera moved just before: a camera that comes to a stop slows
+        down first.
         """
         before = self._shrunk
         if before is None or before.shape != shrunk.shape:

@@ -53,7 +53,8 @@ def readable_scan(sequence: Sequence, frame: int) -> FloatArray | str:
 def lidar_path(sequence: Sequence, progress: Progress = silent) -> LidarPath | Failed | None:
     """Register the scans of a sequence one after the other; None where it has fewer than two.
 
-    Scans that cannot be read are left out, with one warning; a failure, without one, where fewer than two can.
+    Scans that cannot be read are left out, with one warning; a failure, without one, where fewer
+    than two can.
     """
     scanned = [k for k in range(len(sequence)) if sequence.has_scan(k)]
     T_camera_lidar = sequence.T_camera_lidar

@@ -1,16 +1,14 @@
-"""The road: the length of a step in camera heights by its homography, and the ground plane fitted to learned depth.
+"""The road between two images: the length of a step in camera heights, by a homography.
 
-A plane ``n . X = h`` of the current camera maps to the previous one by the homography ``R + t n^T / h``
-(Hartley and Zisserman 2004, Eq. 13.2). Rotation and direction of ``t`` are known from corners; the vector
-``m = |t| n / h`` that aligns both images of the road is estimated; its norm is the length. Learned depth is
-not used, so this length has neither the bias nor the drift of the networks.
+A plane ``n . X = h`` of the current camera maps to the previous one by the homography
+``R + t n^T / h`` (Hartley and Zisserman 2004, Eq. 13.2). Rotation and direction of ``t`` are known
+from corners; the vector ``m = |t| n / h`` that aligns both images of the road is estimated; its
+norm is the length. Learned depth is not used, so this length has neither the bias nor the drift of
+the networks.
 
-Brightness that changes slowly over the image (light, reflections) is removed from the difference of the images.
-Taken from each image before, it would not be the same part of the road in both, for the road is larger in the later
-one: lengths came out 1 % short.
-
-With the plane ``n . X = h`` and a pixel's ray ``r`` (z = 1), ``1 / z = (n / h) . r``: inverse depth is linear in the
-ray, and the ray has no noise, so errors of depth do not bias the fit as they bias a fit to points.
+Brightness that changes slowly over the image (light, reflections) is removed from the difference of
+the images. Taken from each image before, it would not be the same part of the road in both, for the
+road is larger in the later one: lengths came out 1 % short.
 """
 
 from __future__ import annotations
@@ -23,62 +21,45 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import DepthMap, Ends, Frame, Intrinsics, Mask, resized_mask, slopes_of
+from slam.frames import Ends, Frame, Intrinsics, Mask, resized_mask, slopes_of
 from slam.frontend.visual.motion import Steps, links, triangulated
-from slam.frontend.visual.self_calibration import DepthError
 from slam.geometry.robust import mad_sigma, running_median
 from slam.geometry.se3 import FloatArray, chain, invert, path_distance
 from slam.runtime.errors import Failed
 
 _LEVEL = np.array([0.0, 1.0, 0.0])
-_LENGTHS_HEIGHTS = np.geomspace(
-    0.02, 2.5, 32, dtype=np.float32
-)  # searched; refinement converges between them
+# searched; refinement converges between them
+_LENGTHS_HEIGHTS = np.geomspace(0.02, 2.5, 32, dtype=np.float32)
 _CLIPPED_GREY = 8.0
 _ITERATIONS = 6
 _CONVERGED = 1e-3  # of the length, whose sigma is fifty times as large
 _STEPS_KEPT = 100
-
-_Layer = NDArray[np.float32]
-# strips of ground, a long one and a short one before a vehicle: farthest ground and half width, in camera heights, and
-# the relative sigma of independent errors that add up as those of neighbouring lengths do, which are correlated; single
-# lengths err by a third to a half of it
+# strips of ground, a long one and a short one before a vehicle: farthest ground and half width, in
+# camera heights, and the relative sigma of independent errors that add up as those of neighbouring
+# lengths do, which are correlated; single lengths err by a third to a half of it
 _SHAPES = (9.0, 1.0, 0.06), (4.5, 2.0, 0.1)
 _POINTS = 2500  # approximate number of aligned pixels
 _MIN_POINTS = 300  # least number of aligned pixels of a measurement
 _TILT_SIGMA_DEG = 0.07  # sigma of the ground plane's tilt against the direction of motion, degrees
 _MAX_TILT_DEG = 4.0  # largest tilt of the ground plane, degrees
 _MIN_CORRELATION = 0.3  # least correlation of the aligned pixels
-_MIN_GAIN = (
-    0.25  # least fraction of the photometric error without motion that the alignment removes
-)
+# least fraction of the photometric error without motion that the alignment removes
+_MIN_GAIN = 0.25
 _REACH_HEIGHTS = 2.5  # of the path before and after a frame, in camera heights: 4 m of a car
 _USUAL_STEPS = 101  # whose median direction is the usual one
 _PITCH_SIGMA_DEG = 0.3  # of a car against its usual pitch, degrees
 _OF_PATH = 0.5  # noise of the path's direction over that of a single step
-_PLANE_POINTS = 1500
-_LEAST_POINTS = 50
-_HYPOTHESES = 150
-_REWEIGHTINGS = 8
-_ROAD_ROWS = (
-    0.35,
-    0.97,
-)  # top and bottom edge of the road, from horizon (0) to image bottom (1): above a bonnet
-_ROAD_TOP_WIDTH = 0.16  # width of the top edge over that of the image
-_ROAD_BOTTOM_WIDTH = 0.5  # width of the bottom edge over that of the image
-_MAX_PLANE_TILT_DEG = (
-    12.0  # largest angle between the plane's normal and the camera's y axis, degrees
-)
-_INLIER_RELATIVE_DEPTH = 0.05  # largest relative depth error of a plane inlier
-_MIN_INLIER_RATIO = 0.5  # least inlier ratio of a usable frame
+
+_Layer = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class RoadStep:
     """What the images of the road say of the vector ``m`` ``(3,)`` of a step, whose norm is its length in heights.
 
-    ``information`` ``(3, 3)`` and ``right`` ``(3,)`` are their normal equations, without what is expected of the road's
-    normal; ``plane`` is their solution with it. ``relative_sigma`` is that of the length.
+    ``information`` ``(3, 3)`` and ``right`` ``(3,)`` are their normal equations, without what is
+    expected of the road's normal; ``plane`` is their solution with it. ``relative_sigma`` is that
+    of the length.
     """
 
     plane: FloatArray
@@ -100,8 +81,8 @@ class RoadStep:
 class RoadHomography:
     """Aligns the road between two frames of one sequence by its homography, and tracks the direction of motion.
 
-    A car ahead occludes most of a long strip of road and stands still in the image. Where the long strip fails, a
-    short and wide one is used, which ends before such a car; it is less accurate.
+    A car ahead occludes most of a long strip of road and stands still in the image. Where the long
+    strip fails, a short and wide one is used, which ends before such a car; it is less accurate.
     """
 
     def __init__(self, intrinsics: Intrinsics) -> None:
@@ -125,14 +106,16 @@ class RoadHomography:
             previous: the earlier frame, at the size of the intrinsics.
             current: the later frame.
             T_previous_current: its pose in the earlier camera, of any length but zero.
-            standing: pixels ``(h, w)`` of images of any size that do not show the world; None where all do.
+            standing: pixels ``(h, w)`` of images of any size that do not show the world; None where
+                all do.
         """
         if standing is not self._standing:
             self._standing, self._strips = standing, self._visible(standing)
         T_unit = T_previous_current.copy()
         T_unit[:3, 3] /= np.linalg.norm(T_unit[:3, 3])
         self._directions = (*self._directions, T_unit[:3, 3])[-_STEPS_KEPT:]
-        # of a level camera, pitched so that the motion is parallel to the road: the images alone tell pitch poorly
+        # of a level camera, pitched so that the motion is parallel to the road: the images alone
+        # tell pitch poorly
         expected = _normal_along(np.median(self._directions, axis=0))
         long, near = self._strips
         measured = self._measured_on(long, previous, current, T_unit, expected)
@@ -164,9 +147,9 @@ class RoadHomography:
                 strip, layer_before, layer_now, T_unit, plane, expected
             )
             plane = step.plane
-        standing = _correlation(
-            *(strip.local(fine[strip.rows, strip.columns, 0]) for _, fine in (before, now))
-        )
+        fine_before = strip.local(before[1][strip.rows, strip.columns, 0])
+        fine_now = strip.local(now[1][strip.rows, strip.columns, 0])
+        standing = _correlation(fine_before, fine_now)
         length = float(np.linalg.norm(plane))
         deviation = float(np.arccos(np.clip(plane / length @ expected, -1.0, 1.0)))
         if not np.isfinite(length) or deviation > np.deg2rad(_MAX_TILT_DEG):
@@ -203,7 +186,8 @@ class RoadHomography:
         x, y, z = np.moveaxis(points_previous, -2, 0)
         u = camera.fx * x / z + camera.cx
         v = camera.fy * y / z + camera.cy - self._top_row
-        columns, rows = (np.asarray(side, np.float32).reshape(-1, u.shape[-1]) for side in (u, v))
+        columns = np.asarray(u, np.float32).reshape(-1, u.shape[-1])
+        rows = np.asarray(v, np.float32).reshape(-1, u.shape[-1])
         return np.asarray(cv2.remap(layer, columns, rows, cv2.INTER_LINEAR)).reshape(*u.shape, 3)
 
     def _search(
@@ -213,12 +197,8 @@ class RoadHomography:
         rays, seen = strip.rays[:, ::3], now[strip.rows[::3], strip.columns[::3], 0]
         R, t, n = _single(T_unit[:3, :3], T_unit[:3, 3], normal)
         shift = np.outer(t, n @ rays)
-        difference = (
-            self._sampled(before, _ahead(R @ rays + _LENGTHS_HEIGHTS[:, None, None] * shift))[
-                ..., 0
-            ]
-            - seen
-        )
+        points = _ahead(R @ rays + _LENGTHS_HEIGHTS[:, None, None] * shift)
+        difference = self._sampled(before, points)[..., 0] - seen
         costs = np.minimum(np.abs(difference), _CLIPPED_GREY).mean(axis=1)
         return np.asarray(_LENGTHS_HEIGHTS[int(np.argmin(costs))] * normal)
 
@@ -256,10 +236,11 @@ class RoadHomography:
 def with_slope(road_steps: Mapping[Ends, RoadStep], steps: Steps) -> dict[Ends, RoadStep]:
     """The lengths of a drive by the road, with the camera's pitch against it by the path of all ``steps``, unscaled.
 
-    A car pitches on its springs, by which a length errs by 7 to 8 % a degree, and the images of the road tell its pitch
-    poorly. Single directions of motion tell it poorly too, for the camera also rises and falls. Over eight metres
-    around a frame the path is parallel to the road; where directions are noisy, it is so only on the average of many
-    steps (``docs/design/scale-and-lengths.md``).
+    A car pitches on its springs, by which a length errs by 7 to 8 % a degree, and the images of the
+    road tell its pitch poorly. Single directions of motion tell it poorly too, for the camera also
+    rises and falls. Over eight metres around a frame the path is parallel to the road; where
+    directions are noisy, it is so only on the average of many steps
+    (``docs/design/scale-and-lengths.md``).
     """
     motions = {ends: motion for ends, motion in triangulated(steps).items() if ends in road_steps}
     if not motions:
@@ -280,11 +261,10 @@ def with_slope(road_steps: Mapping[Ends, RoadStep], steps: Steps) -> dict[Ends, 
     )
     noise = _OF_PATH * mad_sigma((own - around)[:, 1])
     share = 1.0 / (1.0 + (noise / np.deg2rad(_PITCH_SIGMA_DEG)) ** 2)
-    directions = zip(motions, usual + share * (around - usual), strict=True)
-    return {
-        **road_steps,
-        **{ends: road_steps[ends].along(direction) for ends, direction in directions},
-    }
+    sloped = dict(road_steps)
+    for ends, direction in zip(motions, usual + share * (around - usual), strict=True):
+        sloped[ends] = road_steps[ends].along(direction)
+    return sloped
 
 
 def _path_directions(steps: Steps, reach: float) -> dict[int, FloatArray]:
@@ -297,25 +277,29 @@ def _path_directions(steps: Steps, reach: float) -> dict[int, FloatArray]:
         run = list(consecutive)
         T = chain(np.array([steps[ends].relative_pose.T_from_to for ends in run]))
         places = path_distance(T)
-        behind, ahead = (
-            np.column_stack(
-                [np.interp(places + sign * reach, places, T[:, axis, 3]) for axis in range(3)]
-            )
-            for sign in (-1, 1)
-        )
+        behind = _interpolated(places - reach, places, T[:, :3, 3])
+        ahead = _interpolated(places + reach, places, T[:, :3, 3])
         chords = np.einsum("nba,nb->na", T[:, :3, :3], ahead - behind)
         seen_from = [run[0][0], *(last for _, last in run)]
-        known = zip(seen_from, chords, np.linalg.norm(chords, axis=1), strict=True)
-        found |= {frame: chord / length for frame, chord, length in known if length > reach}
+        lengths = np.linalg.norm(chords, axis=1)
+        for frame, chord, length in zip(seen_from, chords, lengths, strict=True):
+            if length > reach:
+                found[frame] = chord / length
     return found
+
+
+def _interpolated(at: FloatArray, places: FloatArray, centres: FloatArray) -> FloatArray:
+    """Centres ``(M, 3)`` at places ``(M,)`` along a path, of ``(N, 3)`` at places ``(N,)``."""
+    return np.column_stack([np.interp(at, places, axis) for axis in centres.T])
 
 
 @dataclass(frozen=True)
 class _Strip:
     """Pixels ``(P,)`` that see a strip of a level road, rows from the first below the horizon, and rays ``(3, P)``.
 
-    They lie on a grid; ``places`` are their rows and columns there, ``coverage`` ``(H, W)`` is the blurred mask of
-    them, ``gradual`` the sigma of the blur, and ``relative_sigma`` that of step lengths.
+    They lie on a grid; ``places`` are their rows and columns there, ``coverage`` ``(H, W)`` is the
+    blurred mask of them, ``gradual`` the sigma of the blur, and ``relative_sigma`` that of step
+    lengths.
     """
 
     relative_sigma: float
@@ -399,101 +383,3 @@ def _ahead(points: _Layer) -> _Layer:
 
 def _correlation(a: _Layer, b: _Layer) -> float:
     return float((a * b).sum() / max(float(np.sqrt((a**2).sum() * (b**2).sum())), 1e-9))
-
-
-class GroundPlaneFitter:
-    """Fits the road in a trapezoid in front of the car, by RANSAC and reweighted least squares on inverse depth."""
-
-    def __init__(self, intrinsics: Intrinsics, seed: int = 0) -> None:
-        """Sample the pixels of the trapezoid; ``seed`` is that of RANSAC."""
-        self._seed = seed
-        # rows, columns (P,) and rays (P, 3) of about so many pixels; the horizon is taken at cy (a level camera)
-        horizon, bottom = intrinsics.cy, intrinsics.height - 1.0
-        top_row, bottom_row = (horizon + share * (bottom - horizon) for share in _ROAD_ROWS)
-        area = (
-            intrinsics.width * (bottom_row - top_row) * (_ROAD_TOP_WIDTH + _ROAD_BOTTOM_WIDTH) / 2
-        )
-        step = max(1.0, float(np.sqrt(max(area, 1.0) / _PLANE_POINTS)))
-        rows_seen = np.unique(
-            np.clip(np.arange(top_row, bottom_row, step), 0, bottom).astype(np.int64)
-        )
-        rows, columns = [], []
-        for row in rows_seen:
-            share = (row - top_row) / (bottom_row - top_row)
-            width = _ROAD_TOP_WIDTH + share * (_ROAD_BOTTOM_WIDTH - _ROAD_TOP_WIDTH)
-            half = width * intrinsics.width / 2
-            across = np.arange(intrinsics.cx - half, intrinsics.cx + half, step)
-            across = np.unique(across[(across >= 0) & (across < intrinsics.width)].astype(np.int64))
-            columns.append(across)
-            rows.append(np.full(len(across), row))
-        empty = [np.empty(0, dtype=np.int64)]
-        v, u = np.concatenate(rows or empty), np.concatenate(columns or empty)
-        self._rows, self._columns, self._rays = v, u, intrinsics.rays(np.stack([u, v], axis=-1))
-
-    def fit(self, depth_unscaled: DepthMap, error: DepthError) -> float | Failed:
-        """The camera's unscaled height over the plane of learned z-depth ``(H, W)`` without the bias by its ``error``.
-
-        The depth is at the size of the intrinsics; where it is unknown it is left out.
-        """
-        depth = error.corrected(depth_unscaled[self._rows, self._columns].astype(np.float64))
-        inverse_depth = 1.0 / np.maximum(depth, 1e-9)
-        usable = (inverse_depth > 0) & (inverse_depth < 1e8)  # false for NaN
-        if usable.sum() < _LEAST_POINTS:
-            return Failed("the depth in front of the car is not usable")
-        rays, inverse_depth = self._rays[usable], inverse_depth[usable]  # (P, 3), (P,)
-        scaled_normal = _ransac(rays, inverse_depth, self._seed)
-        if scaled_normal is None:
-            return Failed(
-                f"no plane within {_MAX_PLANE_TILT_DEG:g} deg of level in front of the car"
-            )
-        scaled_normal = _reweighted(rays, inverse_depth, scaled_normal)
-        height = 1.0 / float(np.linalg.norm(scaled_normal))
-        inlier_ratio = float(_inliers(rays, inverse_depth, scaled_normal[None])[0].mean())
-        if scaled_normal[1] * height < np.cos(np.deg2rad(_MAX_PLANE_TILT_DEG)):
-            return Failed(
-                f"the plane in front of the car is tilted by more than {_MAX_PLANE_TILT_DEG:g} deg"
-            )
-        if inlier_ratio < _MIN_INLIER_RATIO:
-            return Failed(
-                f"only {inlier_ratio:.0%} of the pixels in front of the car lie on one plane"
-            )
-        return height
-
-
-def _ransac(rays: FloatArray, inverse_depth: FloatArray, seed: int) -> FloatArray | None:
-    """``n / h`` ``(3,)`` of the level plane with most inliers, or None."""
-    rng = np.random.default_rng(seed)
-    samples = rng.integers(len(rays), size=(_HYPOTHESES, 3))
-    minimal = rays[samples]  # (S, 3, 3)
-    solvable = np.abs(np.linalg.det(minimal)) > 1e-6
-    if not solvable.any():
-        return None
-    planes = np.linalg.solve(minimal[solvable], inverse_depth[samples[solvable]][..., None])[
-        ..., 0
-    ]  # (S, 3)
-    level = planes[:, 1] > np.cos(np.deg2rad(_MAX_PLANE_TILT_DEG)) * np.linalg.norm(planes, axis=1)
-    if not level.any():
-        return None
-    planes = planes[level]
-    votes = _inliers(rays, inverse_depth, planes).sum(axis=1)
-    best: FloatArray = planes[votes.argmax()]
-    return best
-
-
-def _inliers(rays: FloatArray, inverse_depth: FloatArray, planes: FloatArray) -> NDArray[np.bool_]:
-    """Inliers ``(S, P)`` of planes ``n / h`` ``(S, 3)`` by the relative error of depth."""
-    over_measured = (rays / inverse_depth[:, None]).T.astype(np.float32)
-    relative = planes.astype(np.float32) @ over_measured
-    relative -= 1.0
-    return np.asarray(np.abs(relative, out=relative) < _INLIER_RELATIVE_DEPTH)
-
-
-def _reweighted(rays: FloatArray, inverse_depth: FloatArray, plane: FloatArray) -> FloatArray:
-    """Refine ``n / h`` by least squares with Cauchy weights on the relative error of inverse depth."""
-    for _ in range(_REWEIGHTINGS):
-        predicted = np.maximum(rays @ plane, 1e-9)
-        residual = inverse_depth / predicted - 1.0
-        weights = 1.0 / (predicted**2 * (1.0 + (residual / (0.5 * _INLIER_RELATIVE_DEPTH)) ** 2))
-        weighted = rays * weights[:, None]
-        plane = np.linalg.solve(weighted.T @ rays, weighted.T @ inverse_depth)
-    return plane

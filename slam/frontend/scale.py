@@ -1,15 +1,16 @@
 """The unit of a run and the lengths of its steps, by mode: camera height over the ground plane, LiDAR, a reference.
 
-A monocular step has a direction and no length. Three measurements give the length: points triangulated by two steps
-that share a frame give the ratio of both lengths; the road's homography gives it in camera heights; learned depth gives
-it in a unit that drifts. A vehicle's acceleration bounds the change of speed. In logarithms all of them are linear in
-the lengths ``x`` and the unit's deviation ``b``, with ``t`` the duration of a step:
+A monocular step has a direction and no length. Three measurements give the length: points
+triangulated by two steps that share a frame give the ratio of both lengths; the road's homography
+gives it in camera heights; learned depth gives it in a unit that drifts. A vehicle's acceleration
+bounds the change of speed. In logarithms all of them are linear in the lengths ``x`` and the unit's
+deviation ``b``, with ``t`` the duration of a step:
 
     x_k - x_{k-1} = ratio_k        x_k = road_k        x_k - b_k = learned_k        b_k - b_{k-1} = 0
     x_k - x_{k-1} = log(t_k / t_{k-1})
 
-solved for the whole drive by robust least squares, whose matrix is banded (``docs/design/scale-and-lengths.md``). The
-mode decides which measurements are absolute.
+solved for the whole drive by robust least squares, whose matrix is banded
+(``docs/design/scale-and-lengths.md``). The mode decides which measurements are absolute.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -26,6 +28,7 @@ from scipy.linalg import solveh_banded
 from slam.config.sections import ScaleConfig, ScaleMode
 from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
+from slam.frontend.road import RoadStep
 from slam.frontend.visual.motion import Motion, links, triangulated
 from slam.geometry.robust import mad_sigma, running_median
 from slam.geometry.se3 import FloatArray
@@ -34,9 +37,8 @@ from slam.runtime.errors import Failed, SlamError
 LengthUnit = Literal["metres", "camera heights", "no metric unit", "the networks' own unit"]
 
 logger = logging.getLogger(__name__)
-_LEAST_ROAD = (
-    1 / 3
-)  # of the frames, half of which have learned depth; fewer see a floor or a table now and then
+# of the frames, half of which have learned depth; fewer see a floor or a table now and then
+_LEAST_ROAD = 1 / 3
 _MAX_CONTRADICTION = 2.5  # largest factor between a measured length and that by learned depth
 _REFERENCE_FRAMES = 50  # number of first frames that mode reference compares
 _REJECTION_SIGMAS = 3.0  # distance from the median beyond which a frame is left out
@@ -46,11 +48,13 @@ _ITERATIONS = 20
 _HUBER_ITERATIONS = 5
 _HUBER_K = 1.345
 _MOST_CORRELATED = 0.999
-# sigmas of logarithms: of a length by learned depth, measured on drives with truth, and least of the ratio of two steps
+# sigmas of logarithms: of a length by learned depth, measured on drives with truth, and least of
+# the ratio of two steps
 _LEARNED_SIGMA, _RATIO_SIGMA = 0.1, 0.004
 OUTLIER_SIGMAS = 2.0  # residual at which the robust weight of a measurement is one half
 _RATIO_WIDENING = 1.5  # factor on the sigma of a ratio measured by triangulated points
-# factor on the sigma of a length by learned depth where the road gives it too, whose errors fewer neighbours share
+# factor on the sigma of a length by learned depth where the road gives it too, whose errors fewer
+# neighbours share
 _BESIDE_ROAD = 4.0
 _UNIT_WALK_SIGMA = 0.003  # sigma per step of the random walk of learned depth's scale
 _UNIT_SIGMA = 0.2  # sigma of that scale by the learned ground plane
@@ -58,9 +62,8 @@ _ACCELERATION_SIGMA = 3.0  # of a vehicle, in camera heights: 5 m/s2 at 1.65 m
 _SPEED_STEPS = 11  # window over which the speed is averaged that a change is compared with
 _LENGTH_SIGMA = 0.05  # of a single length where it is compared with the one before
 _CONTRADICTION_SIGMAS = 5.0
-_CORRELATED_WIDENING = (
-    1.5  # factor on the sigmas in the pose graph, for errors correlated along the road
-)
+# factor on the sigmas in the pose graph, for errors correlated along the road
+_CORRELATED_WIDENING = 1.5
 
 
 @dataclass(frozen=True)
@@ -87,8 +90,8 @@ class StepLength(NamedTuple):
 class Scale:
     """``per_frame`` ``(N,)`` times an unscaled length near that frame is a length in ``unit``.
 
-    ``lengths`` of the steps that image geometry measured are in ``unit``. ``estimate`` is that of the mode's unit, or
-    why there is none.
+    ``lengths`` of the steps that image geometry measured are in ``unit``. ``estimate`` is that of
+    the mode's unit, or why there is none.
     """
 
     mode: ScaleMode
@@ -132,38 +135,27 @@ def find_scale(
     drive: Drive,
     lidar_steps: Sequence[RelativePose],
 ) -> Scale:
-    """All lengths of a run in metres, or in camera heights where no mode gives metres (none, reference, known, gps).
+    """All lengths of a run in metres, or in camera heights where the mode gives no metres.
 
-    Without a road in most frames, the planes that were found give no unit that means anything.
+    Modes none, reference, known and gps give none here. Without a road in most frames, the planes
+    that were found give no unit that means anything.
+
+    Args:
+        mode: resolved.
+        camera_height_m: above the road, of mode camera-height; in mode lidar it stands in for the
+            one that the scans measure.
+        drive: completed.
+        lidar_steps: steps by LiDAR, metres, of mode lidar.
     """
-    motions, frames = triangulated(drive.steps), len(drive)
-    metres = _lengths(lidar_steps)
+    motions = triangulated(drive.steps)
+    frames = len(drive)
     height = camera_height_m if mode == "camera-height" else None
     if mode == "lidar":
         height = height_by_lidar(lidar_steps, drive) or camera_height_m
     unit = 1.0 if height is None else height
-    absolute = {
-        ends: (unit * road.length_heights, road.relative_sigma)
-        for ends, road in drive.road_steps.items()
-    }
-    if mode == "lidar":
-        sigmas = {pose.ends: float(pose.sigmas[3]) for pose in lidar_steps}
-        absolute |= {
-            ends: (length, sigmas[ends] / length) for ends, length in metres.items() if length > 0
-        }
+    absolute = _absolute_lengths(drive.road_steps, unit, lidar_steps if mode == "lidar" else ())
     by_planes = scale_from_road(drive.roads, unit)
-    if isinstance(by_planes, Failed):
-        ratios = [
-            absolute[ends][0] / motion.length_unscaled
-            for ends, motion in motions.items()
-            if ends in absolute
-        ]
-        prior_unit = np.full(frames, float(np.median(ratios)) if ratios else 1.0)
-    elif absolute:
-        # steps of known length measure the drift of the unit; rain or a car ahead biases the learned ground plane
-        prior_unit = np.full(frames, by_planes.value)
-    else:
-        prior_unit = scale_track(drive.roads, unit, by_planes)
+    prior_unit = _prior_unit(drive.roads, motions, absolute, by_planes, unit)
     steps = links(motions, frames)
     evidence = gather_evidence(steps, motions, absolute, prior_unit, unit)
     if not isinstance(by_planes, Failed):
@@ -177,7 +169,7 @@ def find_scale(
     misfit = np.abs(evidence.absolute - np.log(solved.length))
     used = int(np.isfinite(misfit).sum())
     estimate = by_planes
-    is_metric = height is not None or (mode == "lidar" and len(metres) > 0)
+    is_metric = height is not None or (mode == "lidar" and len(lidar_steps) > 0)
     named: LengthUnit = "metres" if is_metric else "camera heights"
     if used >= MIN_FRAMES:
         spread = mad_sigma(misfit[np.isfinite(misfit)])
@@ -189,12 +181,57 @@ def find_scale(
     with_road = max(used, 0 if isinstance(by_planes, Failed) else by_planes.frames_used)
     if named == "camera heights" and with_road < _LEAST_ROAD * frames:
         named = "no metric unit"
-    contradicted = [ends for ends, is_so in zip(steps, solved.contradicted, strict=True) if is_so]
-    rows = zip(
-        steps, solved.length, solved.relative_sigma, solved.relative_correlated_sigma, strict=True
-    )
-    lengths = {ends: StepLength(*map(float, row)) for ends, *row in rows if np.isfinite(row[0])}
+    lengths = _solved_lengths(steps, solved)
+    contradicted = list(compress(steps, solved.contradicted))
     return Scale(mode, estimate, per_frame, lengths, named, contradicted)
+
+
+def _absolute_lengths(
+    road_steps: Mapping[Ends, RoadStep], unit: float, lidar_steps: Sequence[RelativePose]
+) -> dict[Ends, tuple[float, float]]:
+    """Lengths by the road, in ``unit`` a camera height, or by LiDAR, and their relative sigmas."""
+    absolute = {}
+    for ends, road in road_steps.items():
+        absolute[ends] = unit * road.length_heights, road.relative_sigma
+    for pose in lidar_steps:
+        length = float(np.linalg.norm(pose.T_from_to[:3, 3]))
+        if length > 0:
+            absolute[pose.ends] = length, float(pose.sigmas[3]) / length
+    return absolute
+
+
+def _prior_unit(
+    roads: Sequence[float | Failed],
+    motions: Mapping[Ends, Motion],
+    absolute: Mapping[Ends, tuple[float, float]],
+    by_planes: ScaleEstimate | Failed,
+    camera_height: float,
+) -> FloatArray:
+    """The mode's unit per unscaled length near each frame ``(N,)``, before lengths are solved."""
+    if isinstance(by_planes, Failed):
+        ratios = []
+        for ends, motion in motions.items():
+            if ends in absolute:
+                ratios.append(absolute[ends][0] / motion.length_unscaled)
+        return np.full(len(roads), float(np.median(ratios)) if ratios else 1.0)
+    if absolute:
+        # steps of known length measure the drift of the unit; rain or a car ahead biases the
+        # learned ground plane
+        return np.full(len(roads), by_planes.value)
+    return scale_track(roads, camera_height, by_planes)
+
+
+def _solved_lengths(steps: Sequence[Ends], solved: StepLengths) -> dict[Ends, StepLength]:
+    """The lengths that were measured."""
+    lengths = {}
+    for row, ends in enumerate(steps):
+        if np.isfinite(solved.length[row]):
+            lengths[ends] = StepLength(
+                float(solved.length[row]),
+                float(solved.relative_sigma[row]),
+                float(solved.relative_correlated_sigma[row]),
+            )
+    return lengths
 
 
 def _lengths(steps: Sequence[RelativePose]) -> dict[Ends, float]:
@@ -207,11 +244,12 @@ def height_by_lidar(lidar_steps: Sequence[RelativePose], drive: Drive) -> float 
     roads = drive.road_steps
     heights = [metres[ends] / roads[ends].length_heights for ends in roads if ends in metres]
     if not heights:
-        heights = [
-            metres[ends] / motion.length_unscaled * height
-            for ends, motion in triangulated(drive.steps).items()
-            if ends in metres and not isinstance(height := drive.roads[ends[0]], Failed)
-        ]
+        for ends, motion in triangulated(drive.steps).items():
+            if ends not in metres:
+                continue
+            plane = drive.roads[ends[0]]
+            if not isinstance(plane, Failed):
+                heights.append(metres[ends] / motion.length_unscaled * plane)
     return float(np.median(heights)) if heights else None
 
 
@@ -245,16 +283,19 @@ def scale_from_reference(
     T_world_camera_unscaled: FloatArray, T_world_camera_true: FloatArray
 ) -> ScaleEstimate | Failed:
     """True path length over estimated path length of the first 50 frames."""
-    estimated, true = (
-        np.linalg.norm(np.diff(T[:_REFERENCE_FRAMES, :3, 3], axis=0), axis=1)
-        for T in (T_world_camera_unscaled, T_world_camera_true)
-    )
+    estimated = _step_lengths(T_world_camera_unscaled[:_REFERENCE_FRAMES])
+    true = _step_lengths(T_world_camera_true[:_REFERENCE_FRAMES])
     if estimated.sum() <= 0 or true.sum() <= 0:
         return Failed(f"the camera does not move within the first {_REFERENCE_FRAMES} frames")
     value = float(true.sum() / estimated.sum())
     moving = estimated > 0.1 * estimated.mean()
     spread = float(np.std(true[moving] / estimated[moving] / value))
     return ScaleEstimate(value, spread, len(estimated) + 1)
+
+
+def _step_lengths(T_world_camera: FloatArray) -> FloatArray:
+    """Lengths ``(N - 1,)`` of the steps of a path ``(N, 4, 4)``."""
+    return np.asarray(np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1))
 
 
 def known_frames(config: ScaleConfig, stamps: FloatArray) -> tuple[int, int]:
@@ -269,10 +310,8 @@ def known_frames(config: ScaleConfig, stamps: FloatArray) -> tuple[int, int]:
             index, inside = end, end < len(stamps)
         else:
             stamp = float(end.removesuffix("s"))
-            index, inside = (
-                int(np.abs(stamps - stamp).argmin()),
-                bool(stamps[0] <= stamp <= stamps[-1]),
-            )
+            index = int(np.abs(stamps - stamp).argmin())
+            inside = bool(stamps[0] <= stamp <= stamps[-1])
         if not inside:
             raise SlamError(
                 f"scale.known_between names {end}, but the drive has frames 0 to {len(stamps) - 1} "
@@ -290,7 +329,16 @@ def known_frames(config: ScaleConfig, stamps: FloatArray) -> tuple[int, int]:
 def scale_from_distance(
     T_world_camera_unscaled: FloatArray, stamps: FloatArray, config: ScaleConfig
 ) -> ScaleEstimate | Failed:
-    """The known distance of two frames over their estimated distance; raises as `known_frames`."""
+    """The known distance of two frames over their estimated distance.
+
+    Args:
+        T_world_camera_unscaled: poses of all frames ``(N, 4, 4)``.
+        stamps: of all frames ``(N,)``, seconds.
+        config: says which two frames, and how far they are apart.
+
+    Raises:
+        SlamError: a frame or stamp outside the drive, or twice the same frame.
+    """
     first, second = known_frames(config, stamps)
     apart = np.linalg.norm(
         T_world_camera_unscaled[second, :3, 3] - T_world_camera_unscaled[first, :3, 3]
@@ -307,6 +355,11 @@ def scale_track(
 
     The unit of learned depth drifts along a drive. Where the 41 frames around a frame hold too few
     usable planes, the estimate of the whole drive is used.
+
+    Args:
+        roads: the camera's unscaled height over the ground plane of each frame.
+        height: the same height in the unit of the result.
+        estimate: of the whole drive.
     """
     ratios = _ratios(roads, height)
     bound = _REJECTION_SIGMAS * max(estimate.spread, 0.02)
@@ -325,9 +378,10 @@ def _ratios(roads: Sequence[float | Failed], height: float) -> FloatArray:
 class StepEvidence:
     """Measurements of S steps, logarithms and their sigmas ``(S,)`` each, NaN where there is none.
 
-    ``ratio`` is the length over that of the step before; ``absolute`` the length in the mode's unit; ``learned``
-    the length by learned depth, already in the prior unit of the networks; ``steady`` the length over that of
-    the step before at constant speed, with the sigma that a vehicle's acceleration gives it.
+    ``ratio`` is the length over that of the step before; ``absolute`` the length in the mode's
+    unit; ``learned`` the length by learned depth, already in the prior unit of the networks;
+    ``steady`` the length over that of the step before at constant speed, with the sigma that a
+    vehicle's acceleration gives it.
     """
 
     ratio: FloatArray
@@ -348,10 +402,11 @@ class StepEvidence:
 class StepLengths:
     """``length`` ``(S,)`` of each step and its ``relative_sigma`` ``(S,)``, NaN without a measurement.
 
-    Errors of steps that share a ratio are correlated: along the drive their sum grows as that of independent errors of
-    ``relative_correlated_sigma`` ``(S,)``. ``unit_correction`` ``(S,)`` times the prior unit of learned depth
-    is its unit near that step. ``contradicted`` ``(S,)`` marks steps whose length is not what learned depth says, or
-    changes from the step before as no vehicle's does.
+    Errors of steps that share a ratio are correlated: along the drive their sum grows as that of
+    independent errors of ``relative_correlated_sigma`` ``(S,)``. ``unit_correction`` ``(S,)`` times
+    the prior unit of learned depth is its unit near that step. ``contradicted`` ``(S,)`` marks
+    steps whose length is not what learned depth says, or changes from the step before as no
+    vehicle's does.
     """
 
     length: FloatArray
@@ -454,13 +509,14 @@ def solve_lengths(evidence: StepEvidence) -> StepLengths:
 def marginals(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Marginals of every length from the upper band ``(3, 2 S)`` of an information matrix.
 
-    Each length is followed by the unit of its step. The matrix is block tridiagonal by step, so the marginal
-    information from all earlier and from all later steps is each a chain of 2x2 Schur complements.
+    Each length is followed by the unit of its step. The matrix is block tridiagonal by step, so the
+    marginal information from all earlier and from all later steps is each a chain of 2x2 Schur
+    complements.
 
     Returns:
-        Sigmas ``(S,)``, and correlations ``(S,)`` with the neighbours' lengths in [0, 1), the mean of both sides.
-        Errors whose correlation falls by a factor r from step to step have a sum of ``(1 + r) / (1 - r)`` times the
-        variance of independent ones.
+        Sigmas ``(S,)``, and correlations ``(S,)`` with the neighbours' lengths in [0, 1), the mean
+        of both sides. Errors whose correlation falls by a factor r from step to step have a sum of
+        ``(1 + r) / (1 - r)`` times the variance of independent ones.
     """
     neighbour, within, main = (band.reshape(-1, 2) for band in information)
     own = np.stack([main[:, 0], within[:, 1], within[:, 1], main[:, 1]], axis=1)
@@ -512,8 +568,8 @@ def _normal_equations(
 ) -> tuple[FloatArray, FloatArray]:
     """The upper band ``(3, N)`` of the weighted normal matrix with ``idle`` on its diagonal, and the right side.
 
-    Of equations ``state[plus] - state[minus] = value``, ``(M,)`` each; the place behind the last state is zero. None
-    ties states that are more than two places apart.
+    Of equations ``state[plus] - state[minus] = value``, ``(M,)`` each; the place behind the last
+    state is zero. None ties states that are more than two places apart.
     """
 
     def added(places: NDArray[np.intp], values: FloatArray) -> FloatArray:

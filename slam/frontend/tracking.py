@@ -1,8 +1,9 @@
 """Sparse optical flow: Shi-Tomasi corners, pyramidal Lucas-Kanade from a predicted motion, and back again as a check.
 
-With a flow predicted from learned depth and the last motion, corners are tracked in the image warped back by it, for
-Lucas-Kanade shifts windows without stretching them (``docs/design/visual-front-end.md``). Those that are not found
-there and back, as on other cars, are tracked in the image as it is.
+With a flow predicted from learned depth and the last motion, corners are tracked in the image
+warped back by it, for Lucas-Kanade shifts windows without stretching them
+(``docs/design/visual-front-end.md``). Those that are not found there and back, as on other cars,
+are tracked in the image as it is.
 """
 
 from __future__ import annotations
@@ -29,15 +30,25 @@ _TILES = 3, 4  # down and across: corners are spread over them
 _NEAREST = 1e-6
 _INVERSIONS = 2
 _DEPTH_WIDTH_PX = 400
+MAX_CORNERS = 800  # of a step: twice as many change no error and take twice the time
 _GRID_PX = 3  # the flow is computed at every third pixel: learned depth has no finer detail
+# displacements that remain after the predicted flow are small
+_PREDICTED_LEVELS = 2
+_ACROSS_PX = 1.0  # largest error of a corner over several steps, by the way across and step by step
+# steps between frames whose rotation is also measured directly: halves its error
+ROTATION_BASELINE = 2
+# tracks below which they are sought again, with the wide window and equal exposure
+FEW_CORNERS = 60
+_WIDE_WINDOW_PX = 31  # side of the window after most tracks were lost, pixels
 
 
 class Search(NamedTuple):
     """A search by windows of ``side`` pixels over ``levels`` of the image pyramid above the full image.
 
-    ``limits`` are most iterations, and the shift in pixels below which they end. A corner is kept if a search ``back``
-    returns to within ``error_px`` by a ``norm`` of this order. That has its own levels and limits and begins where
-    corners came from; without them it is the same search, and begins where they were found.
+    ``limits`` are most iterations, and the shift in pixels below which they end. A corner is kept
+    if a search ``back`` returns to within ``error_px`` by a ``norm`` of this order. That has its
+    own levels and limits and begins where corners came from; without them it is the same search,
+    and begins where they were found.
     """
 
     side: int
@@ -60,23 +71,13 @@ class Texture(NamedTuple):
 
 
 STEP_SEARCH = Search(side=11, levels=4, limits=(30, 0.01), back=None, error_px=0.5, norm=np.inf)
-# OpenCV computes eight columns of a window at once and those that remain one by one: 16 take half the time of 15
+# OpenCV computes eight columns of a window at once and those that remain one by one: 16 take half
+# the time of 15
 KEYFRAME_SEARCH = Search(
     side=16, levels=3, limits=(15, 0.02), back=(1, (10, 0.05)), error_px=0.7, norm=2
 )
-MAX_CORNERS = 800  # of a step: twice as many change no error and take twice the time
 STEP_CORNERS = Texture(quality=0.008, spacing_px=11.0, block_px=5)
 KEYFRAME_CORNERS = Texture(quality=0.0003, spacing_px=12.0, block_px=3)
-# displacements that remain after the predicted flow are small
-_PREDICTED_LEVELS = 2
-_ACROSS_PX = 1.0  # largest error of a corner over several steps, by the way across and step by step
-ROTATION_BASELINE = (
-    2  # steps between frames whose rotation is also measured directly: halves its error
-)
-FEW_CORNERS = (
-    60  # tracks below which they are sought again, with the wide window and equal exposure
-)
-_WIDE_WINDOW_PX = 31  # side of the window after most tracks were lost, pixels
 
 
 def track(
@@ -143,8 +144,8 @@ def new_corners(
 ) -> Pixels:
     """Up to ``count`` Shi-Tomasi corners ``(M, 2)``, apart from each other and from those taken.
 
-    All tiles of the image get equally many for as long as they have some, those that are taken among them: one thing
-    that is all texture would have them all, be it the world or not.
+    All tiles of the image get equally many for as long as they have some, those that are taken
+    among them: one thing that is all texture would have them all, be it the world or not.
 
     Args:
         grey: ``(H, W)``.
@@ -198,7 +199,8 @@ def _away_from(pixels: Pixels, radius: int, shape: tuple[int, ...]) -> NDArray[n
 class Tracks:
     """The same ``M`` scene points in two images: pixels ``(M, 2)`` each, and ``track_ids`` ``(M,)``.
 
-    A corner keeps its identifier from frame to frame for as long as it is tracked. So many were ``sought``.
+    A corner keeps its identifier from frame to frame for as long as it is tracked. So many were
+    ``sought``.
     """
 
     previous: FloatArray
@@ -227,7 +229,12 @@ class CornerTracker:
     ) -> Tracks:
         """Corners of ``previous`` tracked to ``current``.
 
-        The flow between them may be predicted; pixels that are ``standing`` ``(h, w)`` do not belong to the world.
+        Args:
+            previous: the frame before.
+            current: the later frame.
+            predicted_flow: between them; None where nothing predicts it.
+            standing: pixels ``(h, w)`` of images of any size that do not show the world; None where
+                all do.
         """
         if previous.index not in self._corners:
             self._fill(previous, np.zeros((0, 2), np.float32), np.zeros(0, np.int64), standing)
@@ -245,8 +252,8 @@ class CornerTracker:
     ) -> Callable[[], Tracks]:
         """Prepare to track corners of ``previous`` to a frame some steps later, to which they came step by step.
 
-        The function returned does it, in any thread. It keeps corners that both ways find at the same place, which is
-        half the work of tracking them back.
+        The function returned does it, in any thread. It keeps corners that both ways find at the
+        same place, which is half the work of tracking them back.
         """
         nothing: tuple[Pixels, NDArray[np.int64]] = (
             np.zeros((0, 2), np.float32),
@@ -333,7 +340,8 @@ def _by_first_flow(
 class PredictedFlow:
     """Flow of the pixels of an image under a motion (``unit_pose``, ``length``) in a static scene.
 
-    ``length`` and ``depth_previous`` ``(H, W)`` are in one unit; pixels without depth are taken as infinitely far.
+    ``length`` and ``depth_previous`` ``(H, W)`` are in one unit; pixels without depth are taken as
+    infinitely far.
     """
 
     unit_pose: UnitRelativePose

@@ -1,8 +1,8 @@
 """Loop closure over a whole run: candidates, verified loops, and the consistent ones among them.
 
-Loops agree with the odometry and with each other by pairwise consistency as in PCM (Mangelson et al. 2018), between
-neighbours only: two loops whose ends are near each other must close a cycle with the two short stretches of odometry
-between their ends.
+Loops agree with the odometry and with each other by pairwise consistency as in PCM (Mangelson et
+al. 2018), between neighbours only: two loops whose ends are near each other must close a cycle with
+the two short stretches of odometry between their ends.
 """
 
 from __future__ import annotations
@@ -19,19 +19,14 @@ from erfsfm.common.processes import side_by_side
 from slam.config.sections import LoopsConfig
 from slam.frames import Intrinsics, RelativePose, View
 from slam.geometry.se3 import FloatArray, invert, path_distance, rotation_angle
-from slam.loops.recognition import (
-    OF_FRAMES,
-    Loop,
-    LoopThresholds,
-    LoopVerifier,
-    PlaceIndex,
-    RejectedLoop,
-)
+from slam.loops.verification import OF_FRAMES, Loop, LoopThresholds, LoopVerifier, RejectedLoop
+from slam.loops.vocabulary import PlaceIndex
 
 logger = logging.getLogger(__name__)
 
 MOST_REJECTED = 200
-# least distance of the two frames of a loop along the path: in metres, and over the median depth of the corners
+# least distance of the two frames of a loop along the path: in metres, and over the median depth of
+# the corners
 _LEAST_PATH_M = 15.0
 _LEAST_PATH_OVER_DEPTH = 0.75
 _LEAST_GAP_FRAMES = 30  # least distance of the two frames of a loop, frames
@@ -40,9 +35,8 @@ _SAME_PLACE = 0.05  # of the least path of a loop: 0.75 m
 _BLOCK = 256
 Apart = Callable[[NDArray[np.intp]], NDArray[np.bool_]]
 _SUPPORT_SIGMAS = 3.0  # largest difference of supporting loops, sigmas
-_SUPPORT_DRIFT_RATIO = (
-    0.1  # drift of the odometry between supporting loops over the path between them
-)
+# drift of the odometry between supporting loops over the path between them
+_SUPPORT_DRIFT_RATIO = 0.1
 
 
 @dataclass(frozen=True)
@@ -60,14 +54,14 @@ class LoopClosures:
 
     def without(self, dropped: Sequence[RelativePose]) -> LoopClosures:
         """The same after the pose graph dropped some accepted loops."""
-        ends = {(edge.from_index, edge.to_index) for edge in dropped}
-        gone = tuple(
-            loop.refused("contradicts the pose graph")
-            for loop in self.accepted
-            if loop.ends in ends
-        )
-        kept = tuple(loop for loop in self.accepted if loop.ends not in ends)
-        return replace(self, accepted=kept, rejected=gone + self.rejected)
+        ends = {edge.ends for edge in dropped}
+        kept, gone = [], []
+        for loop in self.accepted:
+            if loop.ends in ends:
+                gone.append(loop.refused("contradicts the pose graph"))
+            else:
+                kept.append(loop)
+        return replace(self, accepted=tuple(kept), rejected=(*gone, *self.rejected))
 
     def details(self) -> dict[str, Any]:
         """For ``loops.json``: every accepted loop with its measurement, and the rejected ones with most inliers."""
@@ -111,13 +105,18 @@ def close_loops(
 ) -> LoopClosures:
     """Find the loops of a drive, once after its last frame.
 
-    The ``views`` are in time order, their points in the unit of the odometry ``T_world_camera`` ``(N, 4, 4)``, which
-    ``is_metric`` or not.
+    Args:
+        views: in time order, their points in the unit of the odometry.
+        T_world_camera: the odometry ``(N, 4, 4)``.
+        intrinsics: of all views.
+        config: whether loops are sought.
+        is_metric: whether the unit of the odometry is the metre.
+        seed: of RANSAC.
     """
     if not config.enabled:
         return LoopClosures(not_sought="loop closure is switched off (loops.enabled)")
     track, least = Track.of_drive(T_world_camera), _least_path(views, is_metric)
-    frames = np.array([view.index for view in views], dtype=np.intp)
+    frames = _frames(views)
 
     def apart(rows: NDArray[np.intp]) -> NDArray[np.bool_]:
         is_later = frames[rows, None] - frames >= _LEAST_GAP_FRAMES
@@ -134,8 +133,11 @@ def find_loops(
 ) -> LoopClosures:
     """Loops among the views of a track that are verified and agree with each other.
 
-    The views are in time order, of some rows of the track, their points in the units of their maps; ``apart`` says
-    which may make a loop, see `find_candidates`.
+    Args:
+        views: in time order, of some rows of the track, their points in the units of their maps.
+        track: odometry of the drive or of the keyframes of its maps.
+        apart: says which views may make a loop, see `find_candidates`.
+        verifier: measures the candidates.
     """
 
     def verdicts(candidates: Iterable[Candidate]) -> list[Loop | RejectedLoop]:
@@ -149,9 +151,15 @@ def find_loops(
     tried += verdicts(
         c for c in candidates if c.rank >= _TRIED_FIRST and views[c.later].index in seen_again
     )
-    verified = [verdict for verdict in tried if isinstance(verdict, Loop)]
+    verified: list[Loop] = []
+    refused: list[RejectedLoop] = []
+    for verdict in tried:
+        if isinstance(verdict, Loop):
+            verified.append(verdict)
+        else:
+            refused.append(verdict)
     accepted, rejected = agreeing(verified, track, verifier.thresholds)
-    rejected += [verdict for verdict in tried if isinstance(verdict, RejectedLoop)]
+    rejected += refused
     logger.info(
         "loops: %d candidates, %d verified, %d accepted", len(tried), len(verified), len(accepted)
     )
@@ -165,11 +173,16 @@ def most_inliers_first(loops: Iterable[RejectedLoop]) -> tuple[RejectedLoop, ...
     )
 
 
+def _frames(views: Sequence[View]) -> NDArray[np.intp]:
+    return np.array([view.index for view in views], dtype=np.intp)
+
+
 def _least_path(views: Sequence[View], is_metric: bool) -> float:
     """Least distance of the two frames of a loop along the path, in the unit of the points of the views.
 
-    It is 15 m. Where lengths are no metres, it is three quarters of the median depth of the corners: a camera that has
-    moved less still sees what it saw, whatever the unit and the frame rate, and on streets these are 12 to 19 m.
+    It is 15 m. Where lengths are no metres, it is three quarters of the median depth of the
+    corners: a camera that has moved less still sees what it saw, whatever the unit and the frame
+    rate, and on streets these are 12 to 19 m.
     """
     if is_metric:
         return _LEAST_PATH_M
@@ -181,17 +194,16 @@ def _least_path(views: Sequence[View], is_metric: bool) -> float:
 def _counted_once(loops: Sequence[Loop], path: FloatArray, near: float) -> list[Loop]:
     """The loops with the sigmas of one loop together wherever several join the same two places, of a car that waits.
 
-    Two frames less than ``near`` apart along the ``path`` ``(N,)`` show the same place with the same errors.
+    Two frames less than ``near`` apart along the ``path`` ``(N,)`` show the same place with the
+    same errors.
     """
     ends = path[np.array([loop.ends for loop in loops], int).reshape(-1, 2)]
     alike = (np.abs(ends[:, None] - ends) < near).all(axis=2).sum(axis=1)
-    return [
-        replace(
-            loop,
-            measured=replace(loop.measured, sigmas=float(np.sqrt(count)) * loop.measured.sigmas),
-        )
-        for loop, count in zip(loops, alike, strict=True)
-    ]
+    widened = []
+    for loop, count in zip(loops, alike, strict=True):
+        sigmas = float(np.sqrt(count)) * loop.measured.sigmas
+        widened.append(replace(loop, measured=replace(loop.measured, sigmas=sigmas)))
+    return widened
 
 
 class Candidate(NamedTuple):
@@ -211,12 +223,17 @@ def find_candidates(
 ) -> list[Candidate]:
     """For each view, in time order, the most similar earlier views, the best first.
 
-    ``apart`` says of some views ``(B,)``, by their rows, and of all views whether they may make a loop ``(B, V)``.
+    Args:
+        views: in time order.
+        apart: says of some views ``(B,)``, by their rows, and of all views whether they may make a
+            loop ``(B, V)``.
+        thresholds: how many candidates a view has, how similar, and how far from each other.
     """
     if len(views) < 2 or not any(map(len, views)):
         return []
     weighted = PlaceIndex(views).weights
-    indices, rows = np.array([view.index for view in views]), np.arange(len(views))
+    indices = _frames(views)
+    rows = np.arange(len(views))
     neighbour = np.asarray((weighted[1:] * weighted[:-1]).sum(axis=1)).ravel()
     expected = np.maximum(np.concatenate([neighbour[:1], neighbour]), 1e-3)
     candidates = []
@@ -225,8 +242,8 @@ def find_candidates(
         scores = (weighted[block] @ weighted.T).toarray() / expected[block, None]  # (block, V)
         scores[~apart(block) | (rows >= block[:, None])] = 0.0
         for later, row in zip(block, scores, strict=True):
-            peaks = enumerate(_peaks(row, indices, thresholds))
-            candidates += [Candidate(k, int(later), float(row[k]), rank) for rank, k in peaks]
+            for rank, k in enumerate(_peaks(row, indices, thresholds)):
+                candidates.append(Candidate(k, int(later), float(row[k]), rank))
     return candidates
 
 
@@ -247,8 +264,8 @@ def _peaks(scores: FloatArray, indices: NDArray[np.intp], thresholds: LoopThresh
 class Track:
     """Odometry ``T_world_camera`` ``(N, 4, 4)`` row by row: of the frames of a drive, or of the keyframes of its maps.
 
-    ``path`` ``(N,)`` grows by what odometry may err on. Lengths have one unit within each of ``maps`` ``(N,)``, and
-    maps that odometry relates have one of ``worlds`` ``(N,)``.
+    ``path`` ``(N,)`` grows by what odometry may err on. Lengths have one unit within each of
+    ``maps`` ``(N,)``, and maps that odometry relates have one of ``worlds`` ``(N,)``.
     """
 
     T_world_camera: FloatArray
@@ -275,7 +292,10 @@ def agreeing(
 ) -> tuple[list[Loop], list[RejectedLoop]]:
     """Split verified loops into consistent ones, and ones without support or in conflict with others.
 
-    They are in the unit of the map of their earlier end.
+    Args:
+        loops: in the unit of the map of their earlier end.
+        track: odometry that they should agree with.
+        thresholds: of the support that a loop needs, and of the drift it may correct.
     """
     possible: list[Loop] = []
     kept: list[Loop] = []
@@ -349,13 +369,12 @@ def _votes(
         rotation = rotation_angle(cycle[:, :3, :3])
         translation = np.linalg.norm(cycle[:, :3, 3], axis=1)
         both = np.hypot(sigmas[near], sigmas[k])
-        length = np.linalg.norm(T_earlier[:, :3, 3], axis=1) + np.linalg.norm(
-            T_later[:, :3, 3], axis=1
-        )
+        length_earlier = np.linalg.norm(T_earlier[:, :3, 3], axis=1)
+        length = length_earlier + np.linalg.norm(T_later[:, :3, 3], axis=1)
         drift = np.deg2rad(thresholds.support_drift_deg) * distance[near].sum(axis=1)
         agrees = rotation < _SUPPORT_SIGMAS * both[:, 0] + drift
         agrees &= translation < _SUPPORT_SIGMAS * both[:, 3] + _SUPPORT_DRIFT_RATIO * length
-        votes.append(
-            (len(np.unique(ends[near[agrees], 1])), len(np.unique(ends[near[~agrees], 1])))
-        )
+        supporting = np.unique(ends[near[agrees], 1])
+        conflicting = np.unique(ends[near[~agrees], 1])
+        votes.append((len(supporting), len(conflicting)))
     return votes

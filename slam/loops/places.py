@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from slam.frames import Intrinsics, View
 from slam.geometry.se3 import FloatArray, apply, invert
-from slam.loops.recognition import LoopThresholds, matches
+from slam.loops.verification import LoopThresholds, matches
 from slam.runtime.errors import RunError
 
 _FORMAT = 1
@@ -26,9 +26,8 @@ _ARRAYS = ("camera", "frames", "counts", "T_world_camera", "pixels", "descriptor
 _NEIGHBOURS = 4  # places on either side that a place is matched with
 _LEAST_SIGHTINGS = 3
 _LEAST_ANGLE = np.deg2rad(1.0)  # between two rays of a point
-_LARGEST_DEPTH_ERROR = (
-    0.2  # of learned depth, median: on streets it is 0.06 to 0.12, in a kitchen 0.4
-)
+# of learned depth, median: on streets it is 0.06 to 0.12, in a kitchen 0.4
+_LARGEST_DEPTH_ERROR = 0.2
 
 Rows = NDArray[np.intp]
 
@@ -79,7 +78,8 @@ class Places:
             version = int(content["format"])
         except FileNotFoundError as error:
             raise RunError(f"{path} is missing: run the sequence again") from error
-        # Damaged bytes raise almost anything in zipfile, zlib, tokenize and NumPy: no list of types is complete.
+        # Damaged bytes raise almost anything in zipfile, zlib, tokenize and NumPy: no list of types
+        # is complete.
         except Exception as error:
             reason = " ".join([f"{type(error).__name__}:", *str(error).split()])[:120]
             raise RunError(f"{path} is damaged ({reason}): run the sequence again") from error
@@ -87,21 +87,22 @@ class Places:
             raise RunError(f"{path} has format {version}, this version reads {_FORMAT}: run again")
         width, height, *pinhole = content["camera"].tolist()
         frames, ends = content["frames"].tolist(), np.cumsum(content["counts"])
-        # the part after the last view is empty
-        parts = [
-            np.split(content[name], ends)[: len(frames)]
-            for name in ("pixels", "descriptors", "points")
-        ]
-        views = tuple(View(index, *arrays) for index, *arrays in zip(frames, *parts, strict=True))
+        pixels = np.split(content["pixels"], ends)
+        descriptors = np.split(content["descriptors"], ends)
+        points = np.split(content["points"], ends)
+        views = []
+        for k, frame in enumerate(frames):  # the part after the last view is empty
+            views.append(View(frame, pixels[k], descriptors[k], points[k]))
         camera = Intrinsics(int(width), int(height), *pinhole, undistorted=undistorted)
-        return cls(camera, views, content["T_world_camera"])
+        return cls(camera, tuple(views), content["T_world_camera"])
 
 
 @dataclass(frozen=True)
 class Tracks:
     """Points ``(P, 3)`` in the world, NaN where unknown, and their sightings ``(S,)``.
 
-    A sighting has the row of its place in ``views``, its row there in ``corners``, and that of its ``point``.
+    A sighting has the row of its place in ``views``, its row there in ``corners``, and that of its
+    ``point``.
     """
 
     points: FloatArray
@@ -151,13 +152,13 @@ class PlaceStructure:
     def tracks(self) -> Tracks:
         """Corners of all places joined to points that three or more of them see."""
         first = self._first
-        around = [self._around(row) for row in range(len(self._places.views))]
-        known = [np.isfinite(nearby.points[nearby.point, 0]) for nearby in around]
-        ends = [
-            (first[row] + nearby.point[kept], first[nearby.views[kept]] + nearby.corners[kept])
-            for row, (nearby, kept) in enumerate(zip(around, known, strict=True))
-        ]
-        one, other = (np.concatenate(side) for side in zip(*ends, strict=True))
+        of_places, of_neighbours = [], []
+        for row in range(len(self._places.views)):
+            nearby = self._around(row)
+            known = np.isfinite(nearby.points[nearby.point, 0])
+            of_places.append(first[row] + nearby.point[known])
+            of_neighbours.append(first[nearby.views[known]] + nearby.corners[known])
+        one, other = np.concatenate(of_places), np.concatenate(of_neighbours)
         joined = csr_array((np.ones(len(one)), (one, other)), (first[-1], first[-1]))
         _, track = connected_components(joined, directed=False)
         views = np.repeat(np.arange(len(self._places.views)), np.diff(first))
@@ -169,24 +170,24 @@ class PlaceStructure:
 
     def _triangulated_around(self, row: int) -> Tracks:
         """A point for each corner of a place, by the places around it."""
-        place, pairings = self._places.views[row], []
-        for other in range(
-            max(0, row - _NEIGHBOURS), min(len(self._places.views), row + _NEIGHBOURS + 1)
-        ):
-            rows = np.arange(len(place))
-            pairs = (
-                (rows, rows)
-                if other == row
-                else matches(place, self._places.views[other], self._thresholds)
-            )
-            pairings.append((np.full(len(pairs[0]), other), *pairs))
-        views, corners, seen = (np.concatenate(column) for column in zip(*pairings, strict=True))
-        return self._triangulated(views, seen, corners, len(place))
+        places = self._places.views
+        views, corners, points = [], [], []
+        for other in range(max(0, row - _NEIGHBOURS), min(len(places), row + _NEIGHBOURS + 1)):
+            point = corner = np.arange(len(places[row]))
+            if other != row:
+                point, corner = matches(places[row], places[other], self._thresholds)
+            views.append(np.full(len(corner), other))
+            corners.append(corner)
+            points.append(point)
+        return self._triangulated(
+            np.concatenate(views), np.concatenate(corners), np.concatenate(points), len(places[row])
+        )
 
     def _triangulated(self, views: Rows, corners: Rows, point: Rows, count: int) -> Tracks:
         """Points ``(count, 3)``, NaN where unknown, and the sightings that agree with them.
 
-        A sighting is of a ``point``, at a row of the ``corners`` of a place among the ``views``, ``(S,)`` each.
+        A sighting is of a ``point``, at a row of the ``corners`` of a place among the ``views``,
+        ``(S,)`` each.
         """
         intrinsics, allowed_px = self._places.intrinsics, self._thresholds.reprojection_px
         rays, focal = intrinsics.rays(self.pixels(views, corners)), (intrinsics.fx, intrinsics.fy)
@@ -207,7 +208,8 @@ def triangulate(
 ) -> tuple[FloatArray, FloatArray]:
     """Points ``(count, 3)`` closest to all their rays, and the widest angle between two of each point's rays, radians.
 
-    Least squares of the distances to the rays: ``sum (I - d d^T) (X - c) = 0``. NaN where rays are parallel.
+    Least squares of the distances to the rays: ``sum (I - d d^T) (X - c) = 0``. NaN where rays are
+    parallel.
 
     Args:
         T_camera_world: of each sighting ``(S, 4, 4)``.

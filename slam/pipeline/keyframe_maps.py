@@ -22,15 +22,16 @@ from slam.config.sections import KeyframesConfig, LoopsConfig
 from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent, View
 from slam.frontend.drive import LAST_STEPS, Drive
 from slam.frontend.factors import scaled_poses
+from slam.frontend.keyframes.learned_units import learned_unit
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
 from slam.frontend.keyframes.odometry import KeyframeOdometry
-from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses, learned_unit
+from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.frontend.keyframes.submaps import join, parts_of
 from slam.frontend.scale import Scale
 from slam.geometry.se3 import FloatArray, invert, make, path_distance
 from slam.graph.pose_graph import RelativeSimilarity, optimise_similarities
 from slam.loops.closure import LoopClosures, Track, find_loops, most_inliers_first
-from slam.loops.recognition import OF_KEYFRAMES, Loop, LoopVerifier
+from slam.loops.verification import OF_KEYFRAMES, Loop, LoopVerifier
 from slam.runtime.errors import Failed
 
 logger = logging.getLogger(__name__)

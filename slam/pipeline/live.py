@@ -24,7 +24,7 @@ from slam.frontend.scale import Scale, find_scale, resolve_mode
 from slam.geometry.se3 import FloatArray, apply, compose, invert
 from slam.loops.closure import LoopClosures
 from slam.loops.places import PlaceStructure
-from slam.loops.recognition import OF_KEYFRAMES
+from slam.loops.verification import OF_KEYFRAMES
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.observer import Observer
 from slam.pipeline.run import Recorder, SlamPipeline

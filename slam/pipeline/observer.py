@@ -25,13 +25,14 @@ from slam.frames import (
     resized_mask,
 )
 from slam.frontend.drive import Drive, Keyframe
+from slam.frontend.ground_plane import GroundPlaneFitter
 from slam.frontend.image_gate import ImageGate, Verdict
-from slam.frontend.road import GroundPlaneFitter, RoadHomography, RoadStep
+from slam.frontend.road import RoadHomography, RoadStep
 from slam.frontend.tracking import ROTATION_BASELINE
 from slam.frontend.visual.motion import Motion, path_between, shortest_by_start
 from slam.frontend.visual.odometry import VisualOdometry
 from slam.geometry.se3 import chain, is_se3
-from slam.loops.recognition import FeatureExtractor
+from slam.loops.features import FeatureExtractor
 from slam.pipeline.keyframe_maps import KeyframeTracking
 from slam.runtime.errors import Failed, MissingFrameError, SequenceError, SlamError
 from slam.runtime.resources import SpillFile, Stopwatch, return_freed_memory

@@ -1,15 +1,15 @@
 """Bundle adjustment: cameras and points that fit all sightings best, by Levenberg-Marquardt on the Schur complement.
 
-As in Triggs et al. 2000, section 6.1: the points are eliminated, the cameras' reduced system is solved, dense for a
-window and sparse for all keyframes of a map, the points follow. A camera is perturbed on the left,
-``Exp(xi) T_camera_world``, rotation first.
+As in Triggs et al. 2000, section 6.1: the points are eliminated, the cameras' reduced system is
+solved, dense for a window and sparse for all keyframes of a map, the points follow. A camera is
+perturbed on the left, ``Exp(xi) T_camera_world``, rotation first.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import compress, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,8 +39,8 @@ _StepByDamping = Callable[[float], tuple[FloatArray, FloatArray] | None]
 class Sightings:
     """``S`` sightings of points by cameras, in their order: rows of both ``(S,)``, ``pixels`` ``(S, 2)``, ``depth``.
 
-    Depth ``(S,)`` is that in the camera by its prior, in a unit of this image, with ``depth_sigma`` of its logarithm
-    ``(S,)``; NaN for none. A point is seen at most once by a camera.
+    Depth ``(S,)`` is that in the camera by its prior, in a unit of this image, with ``depth_sigma``
+    of its logarithm ``(S,)``; NaN for none. A point is seen at most once by a camera.
     """
 
     camera: NDArray[np.int64]
@@ -77,7 +77,15 @@ class BundleAdjustment:
         pixel_sigma: float = PIXEL_SIGMA,
         huber: float = _HUBER,
     ) -> None:
-        """Prepare to adjust the cameras that are ``free`` ``(K,)``; residuals beyond ``huber`` sigmas weigh less."""
+        """Prepare to adjust cameras and points.
+
+        Args:
+            sightings: of the points by the cameras.
+            intrinsics: of all cameras.
+            free: cameras that are adjusted ``(K,)``; the others stay.
+            pixel_sigma: of a sighting, pixels.
+            huber: sigmas beyond which residuals weigh less.
+        """
         self._seen, self._pixel_sigma, self._huber = sightings, pixel_sigma, huber
         self._focal = np.array([intrinsics.fx, intrinsics.fy])
         self._rays = intrinsics.rays(sightings.pixels)[:, :2]
@@ -93,11 +101,13 @@ class BundleAdjustment:
         self._free = free
         self._points = int(sightings.point.max()) + 1 if len(sightings) else 0
         ends = np.searchsorted(sightings.camera, np.arange(len(free) + 1))
-        self._rows = [slice(first, last) for first, last in pairwise(ends.tolist())]
-        learned = [
-            first + np.flatnonzero(self._learned[first:last]) for first, last in pairwise(ends)
-        ]
-        self._learned_rows = [rows for rows in learned if len(rows)]
+        self._rows: list[slice] = []
+        self._learned_rows: list[NDArray[np.intp]] = []
+        for first, last in pairwise(ends.tolist()):
+            self._rows.append(slice(first, last))
+            learned = first + np.flatnonzero(self._learned[first:last])
+            if len(learned):
+                self._learned_rows.append(learned)
         self._blocks = self._eliminated_together()
 
     def solve(
@@ -107,7 +117,14 @@ class BundleAdjustment:
         iterations: int,
         tolerance: float = 1e-4,
     ) -> Adjusted:
-        """Adjust from a start until the cost falls by less than ``tolerance`` of itself."""
+        """Adjust from a start.
+
+        Args:
+            T_camera_world: of all cameras ``(K, 4, 4)``.
+            points: in the world ``(P, 3)``.
+            iterations: the most.
+            tolerance: the relative fall of the cost at which it ends.
+        """
         T, X = T_camera_world.copy(), points.copy()
         residuals = self.residuals(T, X)
         cost = self._cost(residuals)
@@ -152,7 +169,8 @@ class BundleAdjustment:
     def _relief(self, logarithms: FloatArray) -> FloatArray:
         """Residuals of depth ``(S,)`` without what those of an image have in common, which is Huber's location.
 
-        It is where an adjustment of the images' units would end, so that derivatives need not know it.
+        It is where an adjustment of the images' units would end, so that derivatives need not know
+        it.
         """
         whitened = np.zeros(len(logarithms))
         if not self._learned_rows:
@@ -210,17 +228,19 @@ class BundleAdjustment:
     ) -> _StepByDamping:
         """Steps of cameras ``(F, 6)`` and points ``(P, 3)`` by the damping, None where the system is singular.
 
-        Its parts are those of cameras ``U`` ``(F, 6, 6)`` and points ``V`` ``(P, 3, 3)``, their coupling ``W``
-        ``(6, 3, S)``, and the right sides.
+        Its parts are those of cameras ``U`` ``(F, 6, 6)`` and points ``V`` ``(P, 3, 3)``, their
+        coupling ``W`` ``(6, 3, S)``, and the right sides.
         """
         root = self.weights(residuals)
-        A, B = (root.T * J for J in self.jacobians(T, X))
+        by_camera, by_point = self.jacobians(T, X)
+        A, B = root.T * by_camera, root.T * by_point
         r = (root * residuals).T
-        of_cameras = [
-            (A[..., rows].reshape(6, -1), r[:, rows].ravel())
-            for rows, is_free in zip(self._rows, self._free, strict=True)
-            if is_free
-        ]
+        own, own_sides = [], []
+        for rows in compress(self._rows, self._free):
+            J = A[..., rows].reshape(6, -1)
+            own.append(J @ J.T)
+            own_sides.append(-J @ r[:, rows].ravel())
+        U, camera_side = np.array(own), np.array(own_sides)
         point, points = self._seen.point, self._points
         V, point_side = np.empty((points, 3, 3)), np.empty((points, 3))
         for i in range(3):
@@ -228,8 +248,6 @@ class BundleAdjustment:
             for j in range(i + 1):
                 V[:, i, j] = V[:, j, i] = np.bincount(point, (B[i] * B[j]).sum(axis=0), points)
         W = A[:, None, 0] * B[:, 0] + A[:, None, 1] * B[:, 1] + A[:, None, 2] * B[:, 2]
-        U = np.array([J @ J.T for J, _ in of_cameras])
-        camera_side = np.array([-J @ residual for J, residual in of_cameras])
 
         def step(damping: float) -> tuple[FloatArray, FloatArray] | None:
             V_inverse = np.asarray(np.linalg.inv(_damped(V, damping)), np.float64)
@@ -244,7 +262,8 @@ class BundleAdjustment:
                 )
                 # row by row: products of small matrices one by one take ten times as long
                 with_points = sum(coupling[:, i, None] * inverse[i] for i in range(3))
-                W_block, WV = (block.dense(part) for part in (coupling, with_points))
+                W_block = block.dense(coupling)
+                WV = block.dense(with_points)
                 # cameras of a block are few, so that the product is small
                 parts.append((block.cameras, -(WV @ W_block.T)))
                 side[block.cameras] -= (WV @ point_side[block.points].ravel()).reshape(-1, 6)
@@ -319,7 +338,8 @@ def solve_sum(parts: Sequence[Part], side: FloatArray) -> FloatArray | None:
     Returns:
         ``(F, 6)``, or None where the sum is singular.
     """
-    unknowns, right = [(6 * cameras[:, None] + _SIX).ravel() for cameras, _ in parts], side.ravel()
+    unknowns = [(6 * cameras[:, None] + _SIX).ravel() for cameras, _ in parts]
+    right = side.ravel()
     try:
         if len(side) <= _MOST_DENSE:
             S = np.zeros((len(right), len(right)))
@@ -328,10 +348,13 @@ def solve_sum(parts: Sequence[Part], side: FloatArray) -> FloatArray | None:
             return np.asarray(
                 cho_solve(cho_factor(S, check_finite=False), right, check_finite=False)
             ).reshape(-1, 6)
-        of_rows = np.concatenate([np.repeat(each, len(each)) for each in unknowns])
-        columns = np.concatenate([np.tile(each, len(each)) for each in unknowns])
-        values = np.concatenate([part.ravel() for _, part in parts])
-        system = csc_array((values, (of_rows, columns)), shape=(len(right), len(right)))
+        entries, of_rows, of_columns = [], [], []
+        for rows, (_, part) in zip(unknowns, parts, strict=True):
+            entries.append(part.ravel())
+            of_rows.append(np.repeat(rows, len(rows)))
+            of_columns.append(np.tile(rows, len(rows)))
+        places = np.concatenate(of_rows), np.concatenate(of_columns)
+        system = csc_array((np.concatenate(entries), places), shape=(len(right), len(right)))
         # as a symmetric one: its pattern decides the order, and pivots stay on the diagonal
         factors = splu(
             system,

@@ -1,8 +1,9 @@
 """How the camera turned since the last image, by aligning small images: bare walls and windows show it without corners.
 
-Small images as PTAM aligns them (Klein and Murray 2008), over the three angles of a turn, with the gradients of the
-first image (Baker and Matthews 2004). Rows of a rolling shutter are read one after another while the camera turns:
-corners are moved to where one moment would show them, by a turn at a steady rate that moves the image as a whole.
+Small images as PTAM aligns them (Klein and Murray 2008), over the three angles of a turn, with the
+gradients of the first image (Baker and Matthews 2004). Rows of a rolling shutter are read one after
+another while the camera turns: corners are moved to where one moment would show them, by a turn at
+a steady rate that moves the image as a whole.
 """
 
 from __future__ import annotations
@@ -63,7 +64,15 @@ def image_turn(
     shift: FloatArray,
     intrinsics: Intrinsics,
 ) -> ImageTurn:
-    """The turn from a guess, from the shift of the whole image or from none, whichever makes the images alike."""
+    """The turn from a guess, from the shift of the whole image or from none, whichever fits best.
+
+    Args:
+        before: the last image.
+        now: this image; of another size, it is not turned.
+        R_guess: a guess of the turn ``(3, 3)``, as ``R_now_before``.
+        shift: of the whole image ``(2,)``, pixels of the full image.
+        intrinsics: of the full image.
+    """
     if before.shape != now.shape:
         return ImageTurn(np.eye(3))
     scale = 1.0 / _REDUCED
@@ -185,9 +194,14 @@ def measured_turn(
     turn: FloatArray,
     intrinsics: Intrinsics,
 ) -> FloatArray:
-    """The turn a second ``(3,)`` between two images, started from the one before; zero with few corners.
+    """The turn a second ``(3,)`` between two images; zero with few corners.
 
-    They were ``before`` ``(M, 2)`` when the middle row was read, and are at ``pixels`` ``(M, 2)`` of the image.
+    Args:
+        before: corners when the middle row of the last image was read ``(M, 2)``.
+        pixels: where this image has them ``(M, 2)``.
+        seconds: between the images.
+        turn: a second, of the time before, from which it is started.
+        intrinsics: of the images, with the time that reading one takes.
     """
     if len(pixels) < _LEAST_CORNERS or seconds <= 0:
         return np.zeros(3)

@@ -1,8 +1,9 @@
 """Keyframes and the points they see: points from learned depth, found again, adjusted with the last keyframes.
 
-Learned depth says what depths of an image are to each other, nothing about the unit of the map: depths of one image fit
-each other much better than those of two images, for they share an unknown unit. What remains is still no independent
-error of each point, so that it weighs less where rays know a depth as well.
+Learned depth says what depths of an image are to each other, nothing about the unit of the map:
+depths of one image fit each other much better than those of two images, for they share an unknown
+unit. What remains is still no independent error of each point, so that it weighs less where rays
+know a depth as well.
 """
 
 from __future__ import annotations
@@ -30,17 +31,20 @@ _MATCHED = KEYFRAME_SEARCH._replace(levels=1)  # guesses are near
 _BORDER_PX = 8
 _LEAST_MATCHED = 8
 _SHARED = 5
-# a keyframe is near if its camera is within this of the median depth, and looks the same way up to this cosine
+# a keyframe is near if its camera is within this of the median depth, and looks the same way up to
+# this cosine
 _NEAR_DEPTHS = 0.5
 _NEAR_COSINE = 0.7
 _ALIGNED_PX = 2.0
 _PROJECTED_PX = 4.0
 _ALIGNED_KEYFRAMES = 4
-# a point that two keyframes do not find is hidden; after three keyframes that find hardly any, so are those that remain
+# a point that two keyframes do not find is hidden; after three keyframes that find hardly any, so
+# are those that remain
 _ATTEMPTS, _MISSES = 2, 3
 _LEAST_FOUND = 0.02
-# most iterations of a bundle adjustment, and the relative fall of the cost at which it ends: each keyframe is adjusted
-# ten times; but in a young map, depth and motion change together at hardly any cost
+# most iterations of a bundle adjustment, and the relative fall of the cost at which it ends: each
+# keyframe is adjusted ten times; but in a young map, depth and motion change together at hardly any
+# cost
 _LIMITS, _YOUNG_LIMITS = (6, 3e-3), (12, 1e-3)
 _YOUNG = 6  # keyframes of a young map
 OUTLIER_PX = 5.0  # residual of a sighting that is taken out, pixels
@@ -100,9 +104,9 @@ class Parallax:
 class TrackedKeyframe:
     """A frame whose corners are sightings: ``track_ids`` ``(M,)`` in order and their ``pixels`` ``(M, 2)``.
 
-    ``places`` ``(M, 2)`` are where its image has them: with a rolling shutter, pixels are as of the middle row.
-    ``learned_depth`` ``(M,)`` is positive, NaN where unknown, ``descriptors`` are ``(M, 32)``; ``grey`` is None once
-    the image is not kept any more.
+    ``places`` ``(M, 2)`` are where its image has them: with a rolling shutter, pixels are as of the
+    middle row. ``learned_depth`` ``(M,)`` is positive, NaN where unknown, ``descriptors`` are
+    ``(M, 32)``; ``grey`` is None once the image is not kept any more.
     """
 
     index: int
@@ -138,8 +142,9 @@ class TrackedKeyframe:
 class LocalMap:
     """One map, from its first keyframe to a loss; ``started`` once it has points.
 
-    ``keyframes`` and ``frames`` are in time order, ``points`` ``(N, 3)`` in the world by track, NaN where unknown.
-    ``turns`` are motions of the camera where no point carries the unit, in the unit of learned depth.
+    ``keyframes`` and ``frames`` are in time order, ``points`` ``(N, 3)`` in the world by track, NaN
+    where unknown. ``turns`` are motions of the camera where no point carries the unit, in the unit
+    of learned depth.
     """
 
     keyframes: list[TrackedKeyframe] = field(default_factory=list)
@@ -186,11 +191,12 @@ class LocalMap:
 
     def views(self, points: FloatArray) -> list[View]:
         """Corners of all keyframes with their points in the camera, of ``points`` ``(N, 3)`` in the world by track."""
-        in_cameras = (
-            apply(k.T_camera_world, points[k.track_ids]).astype(np.float32) for k in self.keyframes
-        )
-        pairs = zip(self.keyframes, in_cameras, strict=True)
-        return [View(k.index, k.pixels.astype(np.float32), k.descriptors, own) for k, own in pairs]
+        views = []
+        for keyframe in self.keyframes:
+            seen = apply(keyframe.T_camera_world, points[keyframe.track_ids]).astype(np.float32)
+            pixels = keyframe.pixels.astype(np.float32)
+            views.append(View(keyframe.index, pixels, keyframe.descriptors, seen))
+        return views
 
     def parallax(self, keyframes: Sequence[TrackedKeyframe]) -> Parallax:
         """Of all points, between those of the keyframes that see them."""
@@ -229,12 +235,12 @@ class LocalMap:
         seen[np.concatenate([keyframe.track_ids for keyframe in self.keyframes[first:]])] = True
         seen &= np.isfinite(self.points[:, 0])
         # older keyframes that share most of these points
-        shared = [
-            (int(seen[keyframe.track_ids].sum()), k)
-            for k, keyframe in enumerate(self.keyframes[:first])
-        ]
-        best = sorted((pair for pair in shared if pair[0] >= _SHARED), reverse=True)[:_ADJUSTED]
-        fixed = sorted(k for _, k in best)
+        shared = []
+        for k, keyframe in enumerate(self.keyframes[:first]):
+            points = int(seen[keyframe.track_ids].sum())
+            if points >= _SHARED:
+                shared.append((points, k))
+        fixed = sorted(k for _, k in sorted(shared, reverse=True)[:_ADJUSTED])
         chosen = [*fixed, *range(first, len(self.keyframes))]
         sightings, track_ids = self.sightings(chosen, seen, intrinsics)
         limits = _YOUNG_LIMITS if len(self.keyframes) <= _YOUNG else _LIMITS
@@ -253,10 +259,20 @@ class LocalMap:
         limits: tuple[int, float],
         outlier_px: float = OUTLIER_PX,
     ) -> tuple[list[TrackIds], TrackIds]:
-        """Adjust the chosen keyframes but the first ``fixed``, and the points that `sightings` gave of them.
+        """Adjust some keyframes and their points.
+
+        Args:
+            chosen: rows of the keyframes.
+            fixed: how many of them stay, the first ones.
+            sightings: of the chosen keyframes, by `sightings`.
+            track_ids: of their points, by `sightings`.
+            intrinsics: of all images.
+            limits: iterations, and the relative fall of the cost at which it ends.
+            outlier_px: residual of a sighting that is taken out, pixels.
 
         Returns:
-            Tracks whose sightings were taken out of each keyframe as outliers, and those that thereby lost their point.
+            Tracks whose sightings were taken out of each keyframe as outliers, and those that
+            thereby lost their point.
         """
         free = np.arange(len(chosen)) >= fixed
         poses = np.array([self.keyframes[k].T_camera_world for k in chosen])

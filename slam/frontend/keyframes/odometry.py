@@ -1,14 +1,11 @@
-"""Camera poses by keyframes: corners are tracked from the last keyframe, cameras are resected against its points.
+"""Camera poses by keyframes: corners are tracked from the last one, cameras are resected.
 
-As in PTAM (Klein and Murray 2007) and ORB-SLAM (Mur-Artal et al. 2015), with optical flow in place of descriptors. At
-30 frames a second the parallax of neighbouring frames is a pixel; geometry over longer baselines needs tracks that do
-not drift, so each corner is compared with its image in the keyframe, not with that in the frame before. A lost camera
-is found again among the keyframes of its map, by corners that match those with points.
-
-A scene without relief fits a motion and its reverse alike, with near and far exchanged. From learned depth alone the
-adjustment may end in the wrong one, and from there no later keyframe leads back. So the first motion with parallax,
-where points have nothing but learned depth, also starts from motions by essential matrix and homographies (Faugeras
-and Lustman 1988), and what fits best is taken.
+Corners are found again in each frame, and cameras are resected against the points of the map, as in
+PTAM (Klein and Murray 2007) and ORB-SLAM (Mur-Artal et al. 2015), with optical flow in place
+of descriptors. At 30 frames a second the parallax of neighbouring frames is a pixel; geometry over
+longer baselines needs tracks that do not drift, so each corner is compared with its image in the
+keyframe, not with that in the frame before. A lost camera is found again by `Relocaliser`, and the
+first motion with parallax is that of `first_motion`.
 """
 
 from __future__ import annotations
@@ -19,10 +16,9 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent, View
-from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Sightings
+from slam.frontend.keyframes.first_motion import first_motion
 from slam.frontend.keyframes.image_turn import (
     ImageTurn,
     SmallImage,
@@ -34,34 +30,17 @@ from slam.frontend.keyframes.image_turn import (
     turned,
 )
 from slam.frontend.keyframes.local_map import (
-    DEPTH_SIGMA,
     LocalMap,
     NewImage,
     TrackedFrame,
     TrackedKeyframe,
     TrackIds,
 )
+from slam.frontend.keyframes.relocalisation import Relocaliser
 from slam.frontend.tracking import KEYFRAME_SEARCH, Pixels, are_inside, new_corners, track
-from slam.frontend.visual.two_view import CORNER_CORRELATION
-from slam.geometry.multiview import (
-    INLIER_PX,
-    MIN_POINTS,
-    Resection,
-    parallax_px,
-    resect,
-    triangulated_depth,
-    unit_pose_by_essential,
-    unit_poses_by_homography,
-)
+from slam.geometry.multiview import INLIER_PX, MIN_POINTS, Resection, parallax_px, resect
 from slam.geometry.se3 import FloatArray, apply, compose, invert, make
-from slam.loops.recognition import (
-    OF_KEYFRAMES,
-    LoopVerifier,
-    PlaceIndex,
-    Sighting,
-    describe,
-    matches,
-)
+from slam.loops.descriptors import describe
 
 logger = logging.getLogger(__name__)
 
@@ -69,38 +48,27 @@ logger = logging.getLogger(__name__)
 _SLIPPED = 8.0 / 3.0
 _MOST_FLOW = 4.0
 _LEAST_SHIFT_PX = 16.0  # smaller ones flow finds by itself
-_LEAST_CORRELATION, _SURE_CORRELATION = (
-    0.4,
-    0.8,
-)  # of turned images, for a guess, and for a measurement
+# of turned images, for a guess, and for a measurement
+_LEAST_CORRELATION = 0.4
+_SURE_CORRELATION = 0.8
 _KEYFRAME_TRACKS_RATIO = 0.25  # ratio of a keyframe's corners still tracked that asks for another
-_MAX_LOST_S = (
-    0.35  # seconds without a pose after which a new map is begun, the next frame's included
-)
+# seconds without a pose after which a new map is begun, the next frame's included
+_MAX_LOST_S = 0.35
 _LAST_FRAMES = 4  # frames in which a pose is looked up
 # median parallax that asks for a keyframe, over the image width; in a map of few keyframes
-_PARALLAX_RATIO, _YOUNG_PARALLAX_RATIO = 0.03, 0.0125
+_PARALLAX_RATIO = 0.03
+_YOUNG_PARALLAX_RATIO = 0.0125
 _YOUNG_KEYFRAMES = 4
 _LOOKED_BACK = 4  # keyframes between which points have parallax before a first motion
 _MAX_CORNERS = 500  # of a keyframe
 _NOTHING: tuple[TrackIds, Pixels] = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
-_PLACES_TRIED = 6
-# a single image has no points of its own that would confirm the pose, so it takes twice those of a loop
-_LEAST_CONFIRMING = 30
-_FIRST_INLIER_PX = 1.0
-_FIRST_LIMITS = (
-    30,
-    1e-4,
-)  # iterations of an adjustment, and the relative fall of the cost at which it ends
-_GAIN = (
-    0.5 * (3.0 * CORNER_CORRELATION) ** 2
-)  # of the cost: three sigmas, of corners whose errors are correlated
 
 
 class KeyframeOdometry:
     """Poses of the frames of one sequence in the unit of each segment's map.
 
-    ``segments`` are the maps so far, of which the last one grows with the frames; ``events`` tell what became of them.
+    ``segments`` are the maps so far, of which the last one grows with the frames; ``events`` tell
+    what became of them.
     """
 
     def __init__(
@@ -110,10 +78,14 @@ class KeyframeOdometry:
         on_keyframe: Callable[[Frame], None] = lambda frame: None,
         relocalises: bool = False,
     ) -> None:
-        """Prepare for the first frame; ``seed`` is that of RANSAC.
+        """Prepare for the first frame.
 
-        ``on_keyframe`` is told of a keyframe before it is adjusted, so that its depth is predicted meanwhile. Where it
-        ``relocalises``, a lost camera is looked for among all keyframes of its map.
+        Args:
+            intrinsics: of all frames.
+            seed: of RANSAC.
+            on_keyframe: is told of a keyframe before it is adjusted, so that its depth is predicted
+                meanwhile.
+            relocalises: whether a lost camera is looked for among all keyframes of its map.
         """
         self._intrinsics = intrinsics
         self._seed = seed
@@ -126,17 +98,16 @@ class KeyframeOdometry:
         self._turn_rate = np.zeros(3)  # a second, where the shutter rolls
         self._small: SmallImage = np.zeros((0, 0), np.float32)
         self.events: list[TrackingEvent] = []
-        self._spread: FloatArray | None = (
-            None  # of the points of the last keyframe, once they are looked for
-        )
+        # of the points of the last keyframe, once they are looked for
+        self._spread: FloatArray | None = None
         self._relocalises = relocalises
         self._relocaliser: Relocaliser | None = None  # of the lost map
 
     def follow(self, frame: Frame) -> None:
         """Track and resect the next usable frame; make it a keyframe where that is wanted.
 
-        Where too few corners are tracked, the turn of the whole image leads to a keyframe of new corners. Depth of the
-        last keyframe has been learned, if it has any.
+        Where too few corners are tracked, the turn of the whole image leads to a keyframe of new
+        corners. Depth of the last keyframe has been learned, if it has any.
         """
         self._follow(frame)
         started = [segment for segment in self.segments if segment.started]
@@ -148,9 +119,8 @@ class KeyframeOdometry:
 
     def _relocalise(self, lost: LocalMap, frame: Frame) -> None:
         """Look for the camera in the lost map; where it is found, the map goes on with this frame as a keyframe."""
-        if (
-            self._relocaliser is None or self._relocaliser.local is not lost
-        ):  # one that begins may be lost at once
+        # one that begins may be lost at once
+        if self._relocaliser is None or self._relocaliser.local is not lost:
             self._relocaliser = Relocaliser(lost, self._intrinsics, self._seed)
         corners = new_corners(frame.grey, _NOTHING[1], _MAX_CORNERS)
         unknown = np.full((len(corners), 3), np.nan, np.float32)
@@ -179,9 +149,8 @@ class KeyframeOdometry:
         images = before, self._small, self._T_last_step[:3, :3], shift, self._intrinsics
         turn = image_turn(*images) if np.hypot(*shift) > _LEAST_SHIFT_PX else None
         since, self._stamp = frame.stamp - self._stamp, frame.stamp
-        if (
-            not self.segments or not self.segments[-1].started
-        ):  # without learned depth there are no points
+        # without learned depth there are no points
+        if not self.segments or not self.segments[-1].started:
             del self.segments[-1:]
             self._begin(frame)
             return
@@ -252,11 +221,9 @@ class KeyframeOdometry:
         corners = keyframe.places[rows].astype(np.float32)
         tracked, kept = track(keyframe.grey, frame.grey, corners, KEYFRAME_SEARCH, guesses)
         kept &= are_inside(tracked, frame.grey.shape)
-        shift = (
-            np.median(tracked[kept] - guesses[kept], axis=0)
-            if kept.any()
-            else np.zeros(2, np.float32)
-        )
+        shift = np.zeros(2, np.float32)
+        if kept.any():
+            shift = np.median(tracked[kept] - guesses[kept], axis=0)
         self._places[rows] = np.where(kept[:, None], tracked, guesses + shift)
         return keyframe.track_ids[rows[kept]], tracked[kept]
 
@@ -295,11 +262,9 @@ class KeyframeOdometry:
         if self._spread is None:
             self._spread = segment.spread(self._intrinsics)
         spread = self._spread[np.searchsorted(segment.keyframes[-1].track_ids, track_ids)]
-        before = (
-            np.isin(track_ids, segment.frames[-1].track_ids)
-            if segment.frames
-            else np.zeros(0, np.bool_)
-        )
+        before = np.zeros(0, np.bool_)
+        if segment.frames:
+            before = np.isin(track_ids, segment.frames[-1].track_ids)
         trusted = before if before.sum() >= MIN_POINTS else None
         pose = resect(
             guesses,
@@ -320,11 +285,9 @@ class KeyframeOdometry:
         settled = segment.parallax(segment.keyframes[-_LOOKED_BACK:]).settled[track_ids]
         if settled.sum() >= MIN_POINTS or known.sum() < MIN_POINTS:
             return
-        tracks, pixels_before, now = (
-            track_ids[known],
-            before.pixels[rows[known]],
-            pixels[known].astype(np.float64),
-        )
+        tracks = track_ids[known]
+        pixels_before = before.pixels[rows[known]]
+        now = pixels[known].astype(np.float64)
         depth = apply(before.T_camera_world, segment.points[tracks])[:, 2]
         T = self._T_camera_world @ invert(before.T_camera_world)
         T_now_before, depth = first_motion(
@@ -338,17 +301,14 @@ class KeyframeOdometry:
         self, last: TrackedKeyframe, track_ids: TrackIds, pixels: Pixels
     ) -> tuple[float, float]:
         """Median parallax, and median shift, of corners ``(M, 2)`` since a keyframe, over the width of the image."""
-        intrinsics, before = (
-            self._intrinsics,
-            last.pixels[np.searchsorted(last.track_ids, track_ids)],
-        )
+        intrinsics = self._intrinsics
+        before = last.pixels[np.searchsorted(last.track_ids, track_ids)]
         R = self._T_camera_world[:3, :3] @ last.T_camera_world[:3, :3].T
         rays_before, rays = intrinsics.rays(before), intrinsics.rays(pixels.astype(np.float64))
         parallax = parallax_px(rays_before, rays, R, (intrinsics.fx, intrinsics.fy))
         shift = np.linalg.norm(pixels - before, axis=1)
-        return float(np.median(parallax)) / intrinsics.width, float(
-            np.median(shift)
-        ) / intrinsics.width
+        width = intrinsics.width
+        return float(np.median(parallax)) / width, float(np.median(shift)) / width
 
     def _add_keyframe(
         self, segment: LocalMap, frame: Frame, track_ids: TrackIds, pixels: Pixels
@@ -361,25 +321,20 @@ class KeyframeOdometry:
             image = NewImage(frame.grey, T, intrinsics)
             pixels = segment.aligned(image, track_ids, pixels)
             again, reprojected = segment.found_again(image, track_ids)
-            track_ids, pixels = (
-                np.concatenate([track_ids, again]),
-                np.concatenate([pixels, reprojected]),
-            )
+            track_ids = np.concatenate([track_ids, again])
+            pixels = np.concatenate([pixels, reprojected])
         fresh = new_corners(frame.grey, pixels, _MAX_CORNERS - len(pixels))
         track_ids = np.concatenate([track_ids, segment.new_tracks(len(fresh))])
         pixels = np.concatenate([pixels, fresh])
         order = np.argsort(track_ids)
         track_ids, places = track_ids[order], pixels[order].astype(np.float64)
         unknown = np.full(len(track_ids), np.nan)
-        middle, descriptors = (
-            in_middle_row(places, self._turn_rate, intrinsics),
-            describe(frame.grey, places),
+        middle = in_middle_row(places, self._turn_rate, intrinsics)
+        descriptors = describe(frame.grey, places)
+        keyframe = TrackedKeyframe(
+            frame.index, T, track_ids, middle, places, unknown, descriptors, frame.grey
         )
-        segment.add(
-            TrackedKeyframe(
-                frame.index, T, track_ids, middle, places, unknown, descriptors, frame.grey
-            )
-        )
+        segment.add(keyframe)
         if is_tracked:
             gone = segment.adjust(intrinsics)
             segment.keyframes[-1] = segment.keyframes[-1].without(gone)
@@ -394,106 +349,3 @@ class KeyframeOdometry:
         """Keep an event and log it."""
         self.events.append(TrackingEvent(frame, event, other, support))
         logger.info("%s", self.events[-1])
-
-
-class Relocaliser:
-    """Finds single images among the keyframes of one map."""
-
-    def __init__(self, local: LocalMap, intrinsics: Intrinsics, seed: int = 0) -> None:
-        """Index the keyframes of the map, at least one; ``seed`` is that of RANSAC."""
-        self.local, self._intrinsics = local, intrinsics
-        self._views, self._T_map_camera = local.views(local.points), local.T_world_camera
-        self._index = PlaceIndex(self._views)
-        self._verifier = LoopVerifier(OF_KEYFRAMES, intrinsics, seed=seed)
-
-    def locate(self, image: View) -> tuple[FloatArray, TrackIds, Pixels, int] | None:
-        """The pose with most inliers at one of the similar keyframes, and all points that confirm it; None with few.
-
-        Returns:
-            ``T_camera_map``, the tracks ``(M,)`` of these points, each once, the pixels ``(M, 2)`` where the image sees
-            them, and the frame of the keyframe with most of them.
-        """
-        # keyframes (M,), rows of their corners and of the image's (M, 2), and points in the map (M, 3)
-        parts = [(np.zeros(0, np.intp), np.zeros((0, 2), np.intp), np.zeros((0, 3)))]
-        for keyframe in self._index.nearest(image, _PLACES_TRIED):
-            view = self._views[keyframe]
-            pairs = np.column_stack(matches(view, image, OF_KEYFRAMES))
-            pairs = pairs[np.isfinite(view.points[pairs[:, 0]]).all(axis=1)]
-            in_map = apply(
-                self._T_map_camera[keyframe], view.points[pairs[:, 0]].astype(np.float64)
-            )
-            parts.append((np.full(len(pairs), keyframe), pairs, in_map))
-        keyframes, rows, points = (np.concatenate(column) for column in zip(*parts, strict=True))
-        best: Sighting | None = None
-        for keyframe in np.unique(keyframes):
-            here = keyframes == keyframe
-            seen = self._verifier.resect(
-                points[here].astype(np.float32), image.pixels[rows[here, 1]]
-            )
-            if isinstance(seen, Sighting) and (
-                best is None or len(seen.inliers) > len(best.inliers)
-            ):
-                best = seen
-        if best is None:
-            return None
-        X = apply(best.T_camera_points, points)
-        ahead = X[:, 2] > 0
-        X[~ahead, 2] = 1.0
-        residual = np.linalg.norm(self._intrinsics.project(X) - image.pixels[rows[:, 1]], axis=1)
-        kept = np.flatnonzero(ahead & (residual < OF_KEYFRAMES.reprojection_px))
-        _, first = np.unique(rows[kept, 1], return_index=True)
-        kept = kept[first]
-        if len(kept) < _LEAST_CONFIRMING:
-            return None
-        seen_by = zip(keyframes[kept].tolist(), rows[kept, 0].tolist(), strict=True)
-        tracks = np.array(
-            [self.local.keyframes[keyframe].track_ids[corner] for keyframe, corner in seen_by]
-        )
-        tracks, once = np.unique(tracks, return_index=True)
-        place = self.local.keyframes[int(np.bincount(keyframes[kept]).argmax())].index
-        return best.T_camera_points, tracks, image.pixels[rows[kept[once], 1]], place
-
-
-def first_motion(
-    T_now_before: FloatArray,
-    pixels_before: FloatArray,
-    pixels: FloatArray,
-    depth: FloatArray,
-    intrinsics: Intrinsics,
-    seed: int = 0,
-) -> tuple[FloatArray, FloatArray]:
-    """``T_now_before`` of two views, and the depth in the first one ``(M,)``, in the unit of a prior.
-
-    From corners at ``pixels_before`` and ``pixels`` ``(M, 2)`` with ``depth`` ``(M,)`` in the first view by the prior.
-    """
-    rays_before, rays = intrinsics.rays(pixels_before), intrinsics.rays(pixels)
-    tolerance = _FIRST_INLIER_PX / intrinsics.fx
-    by_essential = unit_pose_by_essential(rays_before, rays, tolerance, seed)
-    motions = [] if by_essential is None else [by_essential]
-    starts = [(T_now_before, depth)]
-    for motion in motions + unit_poses_by_homography(rays_before, rays, tolerance, seed):
-        triangulated = triangulated_depth(rays_before, rays, motion)
-        ahead = triangulated > 0.0
-        if ahead.any():
-            unit = float(np.median(depth[ahead] / triangulated[ahead]))
-            at = np.where(ahead, np.clip(unit * triangulated, 0.2 * depth, 5.0 * depth), depth)
-            R = Rotation.from_matrix(
-                motion.R_current_previous
-            ).as_matrix()  # OpenCV's are less exact
-            starts.append((make(R, unit * motion.direction), at))
-    rows = np.arange(len(pixels))
-    sightings = Sightings(
-        np.repeat([0, 1], len(rows)),
-        np.tile(rows, 2),
-        np.concatenate([pixels_before, pixels]),
-        np.concatenate([depth, np.full(len(rows), np.nan)]),
-        np.full(2 * len(rows), DEPTH_SIGMA),
-    )
-    problem = BundleAdjustment(sightings, intrinsics, np.array([False, True]))
-    solved = [
-        problem.solve(np.stack([np.eye(4), T]), rays_before * z[:, None], *_FIRST_LIMITS)
-        for T, z in starts
-    ]
-    costs = np.array([adjusted.cost for adjusted in solved])
-    best = solved[int(np.argmin(costs))] if costs.min() < costs[0] - _GAIN else solved[0]
-    return best.T_camera_world[1], best.points[:, 2]

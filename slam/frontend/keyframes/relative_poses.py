@@ -1,7 +1,6 @@
-"""Relative poses from maps of keyframes, keyframe to keyframe and to the frames after it, and the units of the maps.
+"""Relative poses from maps of keyframes: keyframe to keyframe, and to the frames after it.
 
-The unit of a map is by learned depth, with its drift along the map, and by the floor: the height of a carried camera
-above the floor is what all maps of a drive have in common.
+The unit of a map is by learned depth and by the floor.
 """
 
 from __future__ import annotations
@@ -12,40 +11,27 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import solveh_banded
 
 from slam.frames import KEYFRAME_SOURCE, LOOP_SOURCE, Ends, Intrinsics, RelativePose
+from slam.frontend.keyframes.floor import units_by_floor
+from slam.frontend.keyframes.learned_units import learned_unit
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe, TrackIds
 from slam.frontend.visual.two_view import CORNER_CORRELATION
 from slam.geometry.multiview import MIN_POINTS, resect
-from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray, invert
 
 _LEAST_LENGTH = 1e-6
 _RELATIVE_SIGMA = 0.02  # least translation sigma of a factor over the length of its step
 _ROTATION_SIGMA_DEG = 0.1  # least rotation sigma of a factor, degrees
-_LEAST_DEPTHS = 20
-_SHARED = 10  # keyframes that share an error of learned depth
-_SIGMA, _LEAST_SIGMA = (
-    0.3,
-    0.05,
-)  # of the logarithm of the unit of an image's learned depth, where it is not measured
-_SAMPLES, _ROUNDS = 1000, 3
-_MOST_POINTS = 2000  # by which planes are compared
-_LEAST_COSINE = 0.8  # between the plane's normal and down by the cameras, which are held upright
-_THICKNESS = 0.04  # of the floor, over the camera's height
-_LEAST_RATIO, _LEAST_POINTS = 0.04, 25  # points on the floor, over all, and in number
-_MOST_BELOW = 0.5  # points below the floor over those on it: a table has the floor below it
-_MOST_SPREAD = 0.15  # of the camera's height
-_MOST_CONTRADICTION = np.log(1.4)  # between two units of a map: a table is half as high
 
 
 @dataclass(frozen=True)
 class KeyframePoses:
     """Relative ``poses`` and ``loops`` in the units of their maps.
 
-    ``segments`` is the number of the map of every frame that has a pose in one, ``learned_units`` the unit of learned
-    depth per unit of each map, by its number: of all maps alike, where they see one floor.
+    ``segments`` is the number of the map of every frame that has a pose in one, ``learned_units``
+    the unit of learned depth per unit of each map, by its number: of all maps alike, where they see
+    one floor.
     """
 
     poses: Sequence[RelativePose] = ()
@@ -104,10 +90,20 @@ class KeyframePoses:
         return chained(self.poses)
 
 
+NO_MAPS = KeyframePoses()
+
+
 def keyframe_poses(
     maps: Sequence[LocalMap], intrinsics: Intrinsics, seed: int = 0, loops: Sequence[Ends] = ()
 ) -> KeyframePoses:
-    """All relative poses of the maps of a drive; ``loops`` are keyframes of one map that see one place, by frames."""
+    """All relative poses of the maps of a drive.
+
+    Args:
+        maps: in time order; those without points give none.
+        intrinsics: of all images.
+        seed: of RANSAC.
+        loops: frames of two keyframes of one map that see one place.
+    """
     poses: list[RelativePose] = []
     closing: dict[Ends, RelativePose] = {}
     segments: dict[int, int] = {}
@@ -117,7 +113,8 @@ def keyframe_poses(
     for number, segment in enumerate(maps):
         located = _segment_poses(segment, intrinsics, seed)
         poses += located
-        segments |= dict.fromkeys((frame for pose in located for frame in pose.ends), number)
+        for pose in located:
+            segments[pose.from_index] = segments[pose.to_index] = number
         turns += [turn.scaled(1.0 / learned[number]) for turn in segment.turns]
         closing |= _loop_poses(segment, loops, intrinsics, seed)
     outside = [
@@ -222,107 +219,3 @@ def chained(poses: Sequence[RelativePose]) -> dict[int, FloatArray]:
         T_map_from = T_map_camera.setdefault(pose.from_index, np.eye(4))
         T_map_camera[pose.to_index] = T_map_from @ pose.T_from_to
     return T_map_camera
-
-
-def learned_unit(local: LocalMap) -> float:
-    """Learned depth over depth in the map, the median over all sightings by keyframes; 1 where there are few."""
-    joined = np.concatenate([local.ratios(keyframe) for keyframe in local.keyframes])
-    known = joined[joined > 0.0]
-    return float(np.median(1.0 / known)) if len(known) >= _LEAST_DEPTHS else 1.0
-
-
-def learned_units(local: LocalMap, carried: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Learned depth over depth in the map along it ``(K,)``, and over what each keyframe says of it ``(K,)``.
-
-    The logarithm of the unit is a random walk with sigmas ``carried`` ``(K - 1,)`` from each keyframe to the next.
-    """
-    known = [ratios[ratios > 0.0] for ratios in map(local.ratios, local.keyframes)]
-    own = np.array(
-        [-float(np.median(np.log(r))) if len(r) >= _LEAST_DEPTHS else np.nan for r in known]
-    )
-    if not np.isfinite(own).any():
-        return np.ones(len(own)), np.ones(len(own))
-    # the scatter of the units of learned depth about that of the map, by keyframes that share no error
-    apart = own[_SHARED:] - own[:-_SHARED]
-    apart = apart[np.isfinite(apart)]
-    usual = (
-        float(np.clip(mad_sigma(apart) / np.sqrt(2.0), _LEAST_SIGMA, _SIGMA))
-        if len(apart) >= _SHARED
-        else _SIGMA
-    )
-    weight = np.where(np.isfinite(own), 0.5 / _SHARED / usual**2, 0.0)
-    own = np.nan_to_num(own)
-    system = np.zeros((2, len(own)))
-    system[1] = weight
-    system[0, 1:] = -(carried**-2.0)
-    system[1, 1:] += carried**-2.0
-    system[1, :-1] += carried**-2.0
-    walk = np.asarray(solveh_banded(system[-len(own) :], weight * own))
-    return np.exp(walk), np.exp(np.where(weight > 0.0, walk - own, 0.0))
-
-
-def units_by_floor(
-    maps: Sequence[LocalMap], learned_units: Sequence[float], seed: int = 0
-) -> list[float]:
-    """The units of maps, so that the camera has one height in all that see a floor; learned ones where it contradicts.
-
-    ``learned_units`` are those of learned depth per unit of each map, ``seed`` is that of the planes drawn.
-    """
-    units, floors = list(learned_units), {}
-    for row, local in enumerate(maps if len(maps) > 1 else ()):
-        height = height_above_floor(local, seed)
-        if height is not None:
-            floors[row] = height
-    if floors:
-        logarithms = [np.log(height * units[row]) for row, height in floors.items()]
-        common = float(np.exp(np.median(logarithms)))
-        for row, height in floors.items():
-            if abs(np.log(common / height / units[row])) < _MOST_CONTRADICTION:
-                units[row] = common / height
-    return units
-
-
-def height_above_floor(local: LocalMap, seed: int = 0) -> float | None:
-    """The median height of the keyframes above the plane below which nothing is; None where no such plane is seen."""
-    T_map_camera = local.T_world_camera
-    centres, down = T_map_camera[:, :3, 3], T_map_camera[:, :3, 1].mean(axis=0)
-    seen = np.unique(np.concatenate([keyframe.track_ids for keyframe in local.keyframes]))
-    points = local.points[seen[local.parallax(local.keyframes).settled[seen]]]
-    if len(points) < _LEAST_POINTS:
-        return None
-    origin = np.median(centres, axis=0)
-    points, centres = points - origin, centres - origin
-    rng = np.random.default_rng(seed)
-    points = rng.permutation(points)[:_MOST_POINTS]
-    depth = points @ down
-    low = points[depth >= np.median(depth[depth > 0])] if (depth > 0).any() else points
-    corners = low[rng.integers(len(low), size=(_SAMPLES, 3))]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normals, axis=1)
-    normals, first = normals[length > 0] / length[length > 0, None], corners[length > 0, 0]
-    normals *= np.sign(normals @ down)[:, None]
-    heights = np.sum(normals * first, axis=1)
-    possible = (normals @ down > _LEAST_COSINE * np.linalg.norm(down)) & (heights > 0)
-    if not possible.any():
-        return None
-    normals, heights = normals[possible], heights[possible]
-    over = points @ normals.T / heights - 1.0
-    on, below = (np.abs(over) < _THICKNESS).sum(axis=0), (over > _THICKNESS).sum(axis=0)
-    best = int(np.argmax(on - below / _MOST_BELOW))
-    normal, height = normals[best], float(heights[best])
-    for _ in range(_ROUNDS):
-        floor = points[np.abs(points @ normal / height - 1.0) < _THICKNESS]
-        if len(floor) < max(_LEAST_POINTS, _LEAST_RATIO * len(points)):
-            return None
-        middle = floor.mean(axis=0)
-        normal = np.linalg.svd(floor - middle, full_matrices=False)[2][2]
-        normal *= np.sign(normal @ down)
-        height = float(normal @ middle)
-    below = (points @ normal > (1.0 + _THICKNESS) * height).sum()
-    heights_above = height - centres @ normal
-    usual = float(np.median(heights_above))
-    is_level = (
-        normal @ down > _LEAST_COSINE * np.linalg.norm(down)
-        and np.std(heights_above) < _MOST_SPREAD * usual
-    )
-    return usual if is_level and below < _MOST_BELOW * len(floor) else None

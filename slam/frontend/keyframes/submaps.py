@@ -1,7 +1,8 @@
 """Maps of keyframes cut into parts through each of which points carry one unit, and maps of one drive joined.
 
-A camera that turns on the spot sees new points with hardly any parallax. The map goes on with learned depth, whose unit
-may be a tenth off, and every point fits. So it is cut there, and each part has the unit of learned depth or the floor.
+A camera that turns on the spot sees new points with hardly any parallax. The map goes on with
+learned depth, whose unit may be a tenth off, and every point fits. So it is cut there, and each
+part has the unit of learned depth or the floor.
 
 Joined maps are brought into one world, tracks of the same corner made one, all keyframes adjusted.
 """
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import KEYFRAME_SOURCE, Intrinsics, RelativePose
+from slam.frontend.keyframes.learned_units import learned_units
 from slam.frontend.keyframes.local_map import (
     OUTLIER_PX,
     LocalMap,
@@ -25,41 +27,35 @@ from slam.frontend.keyframes.local_map import (
     TrackedKeyframe,
     TrackIds,
 )
-from slam.frontend.keyframes.relative_poses import learned_units
 from slam.geometry.multiview import MIN_POINTS
 from slam.geometry.se3 import FloatArray, apply, chain, invert
 
-_PIXEL_SIGMA = 0.5  # of a sighting, pixels
-_POINT_SIGMA = 0.005  # least relative sigma of the depth of a point
-_INDEPENDENT = (
-    10  # points with independent errors that those of a keyframe are worth: all share its pose
-)
-# sigmas of the logarithm of the unit: to the keyframe from which on points have parallax, and between two of one part
-_BEGUN, _CARRIED = 0.03, 0.05
-_TURNED, _UNKNOWN = (
-    0.05,
-    0.5,
-)  # the most by points without parallax, and where keyframes share few points
-_DRIFT = 0.2  # of the sigma of one carry, that adds up along a map: what one keyframe lacks, the next ones see
-_LEAST_KEYFRAMES = 4  # of a part
-_IMAGE_ROTATION, _IMAGE_LENGTH = (
-    np.deg2rad(0.5),
-    0.03,
-)  # sigmas of a turn of the whole image, radians and depths
-_ROTATION, _LENGTH = (
-    np.deg2rad(0.1),
-    0.01,
-)  # least sigmas by points without parallax, radians and depths
-_DEPTH_SIGMA = 0.2  # of a length by learned depth, over it
 logger = logging.getLogger(__name__)
 
-# outliers are taken out at these multiples of their limit, from a start that is still off by the drift
+_PIXEL_SIGMA = 0.5  # of a sighting, pixels
+_POINT_SIGMA = 0.005  # least relative sigma of the depth of a point
+# points with independent errors that those of a keyframe are worth: all share its pose
+_INDEPENDENT = 10
+# sigmas of the logarithm of the unit
+_BEGUN = 0.03  # to the keyframe from which on points have parallax
+_CARRIED = 0.05  # between two keyframes of one part
+_TURNED = 0.05  # the most by points without parallax
+_UNKNOWN = 0.5  # where keyframes share few points
+# of the sigma of one carry, that adds up along a map: what one keyframe lacks, the next ones see
+_DRIFT = 0.2
+_LEAST_KEYFRAMES = 4  # of a part
+# sigmas of a turn of the whole image, radians and depths
+_IMAGE_ROTATION = np.deg2rad(0.5)
+_IMAGE_LENGTH = 0.03
+# least sigmas by points without parallax, radians and depths
+_ROTATION = np.deg2rad(0.1)
+_LENGTH = 0.01
+_DEPTH_SIGMA = 0.2  # of a length by learned depth, over it
+# outliers are taken out at these multiples of their limit, from a start that is still off by the
+# drift
 _OUTLIER_LIMITS = (4.0, 2.0, 1.0)
-_LIMITS = (
-    20,
-    1e-4,
-)  # iterations of an adjustment, and the relative fall of the cost at which it ends
-
+# iterations of an adjustment, and the relative fall of the cost at which it ends
+_LIMITS = (20, 1e-4)
 
 # rows of an earlier and of a later keyframe, and of the corners of both that are one point (M, 2)
 Shared = tuple[int, int, NDArray[np.intp]]
@@ -68,56 +64,94 @@ Shared = tuple[int, int, NDArray[np.intp]]
 def parts_of(segment: LocalMap, intrinsics: Intrinsics) -> list[LocalMap]:
     """The parts of a map in time order; the map itself where no part has enough keyframes.
 
-    Motions to keyframes and frames outside the parts, and to the next part, are ``turns`` of the part before, those
-    before the first part its own.
+    Motions to keyframes and frames outside the parts, and to the next part, are ``turns`` of the
+    part before, those before the first part its own.
     """
-    keyframes = segment.keyframes
-    shared = np.array(
-        [len(np.intersect1d(a.track_ids, b.track_ids)) for a, b in pairwise(keyframes)]
-    )
-    tied = shared >= MIN_POINTS
+    neighbours = pairwise(segment.keyframes)
+    shared = [len(np.intersect1d(a.track_ids, b.track_ids)) for a, b in neighbours]
+    tied = np.array(shared) >= MIN_POINTS
     sigmas = _sigmas(segment, intrinsics)
     along = np.minimum(sigmas, _TURNED) * np.where(sigmas < _CARRIED, _DRIFT, 1.0)
-    segment = _held(segment, np.where(tied, along, _UNKNOWN))
-    keyframes = segment.keyframes
-    begun, carries = np.flatnonzero(sigmas < _BEGUN), sigmas < _CARRIED
+    held = _held(segment, np.where(tied, along, _UNKNOWN))
+    part_of, parts = _cut(held, tied & _carries(sigmas))
+    if not parts:
+        return [held]
+    _add_turns(parts, part_of, held.keyframes, tied)
+    _add_frames(parts, part_of, held)
+    for part in parts:
+        part.turns.sort(key=lambda turn: turn.to_index)
+    return parts
+
+
+def _carries(sigmas: FloatArray) -> NDArray[np.bool_]:
+    """Whether points carry the unit from each keyframe to the next, by `_sigmas` ``(K - 1,)``."""
+    begun = np.flatnonzero(sigmas < _BEGUN)
+    carries = sigmas < _CARRIED
     carries[: begun[0] if len(begun) else None] = True  # before points have parallax
-    number = np.concatenate([[0], np.cumsum(~(carries & tied))])
-    # the median way of the camera from frame to frame between keyframes that points tie; 0 without any
-    paces = [
-        np.linalg.norm((a.T_camera_world @ invert(b.T_camera_world))[:3, 3]) / (b.index - a.index)
-        for (a, b), is_tied in zip(pairwise(keyframes), tied, strict=True)
-        if is_tied
-    ]
-    pace = float(np.median(paces)) if paces else 0.0
-    runs = [
-        rows
-        for n in range(number[-1] + 1)
-        if len(rows := np.flatnonzero(number == n)) >= _LEAST_KEYFRAMES
-    ]
-    if not runs:
-        return [segment]
-    parts = [LocalMap([keyframes[k] for k in rows], segment.points, [], True) for rows in runs]
-    part = np.full(len(keyframes), -1)
-    for n, rows in enumerate(runs):
-        part[rows] = n
-    before = np.maximum.accumulate(part).clip(min=0)
+    return np.asarray(carries)
+
+
+def _cut(segment: LocalMap, carried: NDArray[np.bool_]) -> tuple[NDArray[np.intp], list[LocalMap]]:
+    """The part of each keyframe ``(K,)``, -1 for none, and the parts with their keyframes alone.
+
+    A part has enough keyframes from each of which the unit is ``carried`` ``(K - 1,)`` to the next.
+    """
+    run_of = np.concatenate([[0], np.cumsum(~carried)])
+    part_of = np.full(len(run_of), -1)
+    parts: list[LocalMap] = []
+    for run in range(run_of[-1] + 1):
+        rows = np.flatnonzero(run_of == run)
+        if len(rows) >= _LEAST_KEYFRAMES:
+            part_of[rows] = len(parts)
+            keyframes = segment.keyframes[rows[0] : rows[-1] + 1]
+            parts.append(LocalMap(keyframes, segment.points, [], True))
+    return part_of, parts
+
+
+def _add_turns(
+    parts: Sequence[LocalMap],
+    part_of: NDArray[np.intp],
+    keyframes: Sequence[TrackedKeyframe],
+    tied: NDArray[np.bool_],
+) -> None:
+    """Motions to keyframes outside the parts, and to the next part, as turns of the part before."""
+    pace = _pace(keyframes, tied)
+    before = _part_before(part_of)
     for k in range(1, len(keyframes)):
-        if part[k] < 0 or part[k] != part[k - 1]:
-            to_next = keyframes[k].index, keyframes[k].T_camera_world
-            parts[before[k - 1]].turns.append(
-                _turn(keyframes[k - 1], *to_next, None if tied[k - 1] else pace)
-            )
-    starts = np.array([keyframe.index for keyframe in keyframes])
+        if part_of[k] < 0 or part_of[k] != part_of[k - 1]:
+            earlier, later = keyframes[k - 1], keyframes[k]
+            by_image = None if tied[k - 1] else pace
+            turn = _turn(earlier, later.index, later.T_camera_world, by_image)
+            parts[before[k - 1]].turns.append(turn)
+
+
+def _add_frames(parts: Sequence[LocalMap], part_of: NDArray[np.intp], segment: LocalMap) -> None:
+    """Frames of a map to its parts; those that were located outside are turns of the part before."""
+    starts = np.array([keyframe.index for keyframe in segment.keyframes])
+    before = _part_before(part_of)
     for frame in segment.frames:
         k = int(np.searchsorted(starts, frame.index, side="right")) - 1
-        if part[k] >= 0:
-            parts[part[k]].frames.append(frame)
+        if part_of[k] >= 0:
+            parts[part_of[k]].frames.append(frame)
         elif frame.T_camera_world is not None and frame.index != starts[k]:
-            parts[before[k]].turns.append(_turn(keyframes[k], frame.index, frame.T_camera_world))
-    for piece in parts:
-        piece.turns.sort(key=lambda turn: turn.to_index)
-    return parts
+            turn = _turn(segment.keyframes[k], frame.index, frame.T_camera_world)
+            parts[before[k]].turns.append(turn)
+
+
+def _part_before(part_of: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The last part up to each keyframe ``(K,)``; the first one where there is none."""
+    return np.asarray(np.maximum.accumulate(part_of).clip(min=0))
+
+
+def _pace(keyframes: Sequence[TrackedKeyframe], tied: NDArray[np.bool_]) -> float:
+    """The median way of the camera a frame between keyframes that points tie; 0 without any."""
+    paces = []
+    for (earlier, later), is_tied in zip(pairwise(keyframes), tied, strict=True):
+        if is_tied:
+            T_earlier_later = earlier.T_camera_world @ invert(later.T_camera_world)
+            frames = later.index - earlier.index
+            paces.append(np.linalg.norm(T_earlier_later[:3, 3]) / frames)
+    return float(np.median(paces)) if paces else 0.0
 
 
 def _held(segment: LocalMap, carried: FloatArray) -> LocalMap:
@@ -127,10 +161,10 @@ def _held(segment: LocalMap, carried: FloatArray) -> LocalMap:
     steps = invert(T[:-1]) @ T[1:]
     steps[:, :3, 3] *= np.sqrt(units[:-1] * units[1:])[:, None]
     held = moved(segment, chain(steps), units)
-    pairs = zip(held.keyframes, corrections, strict=True)
-    held.keyframes = [
-        replace(k, learned_depth=correction * k.learned_depth) for k, correction in pairs
-    ]
+    for row, correction in enumerate(corrections):
+        keyframe = held.keyframes[row]
+        learned = correction * keyframe.learned_depth
+        held.keyframes[row] = replace(keyframe, learned_depth=learned)
     return held
 
 
@@ -139,8 +173,8 @@ def _turn(
 ) -> RelativePose:
     """From a keyframe to a later camera in the unit of learned depth.
 
-    Where no points lead there, but the whole image, it is a turn of unknown small length, whatever later adjustments
-    made of it: at most some way at the camera's ``pace`` by frame.
+    Where no points lead there, but the whole image, it is a turn of unknown small length, whatever
+    later adjustments made of it: at most some way at the camera's ``pace`` by frame.
     """
     T = keyframe.T_camera_world @ invert(T_camera_world)
     learned = keyframe.learned_depth[np.isfinite(keyframe.learned_depth)]
@@ -156,7 +190,8 @@ def _turn(
 def _sigmas(local: LocalMap, intrinsics: Intrinsics) -> FloatArray:
     """Sigmas of the logarithm of the unit as points carry it from each keyframe to the next ``(K - 1,)``.
 
-    A point carries it by its parallax between the first camera that saw it and those up to the earlier keyframe.
+    A point carries it by its parallax between the first camera that saw it and those up to the
+    earlier keyframe.
     """
     parallax = Parallax(local.points)
     pixel = _PIXEL_SIGMA / intrinsics.fx
@@ -164,12 +199,8 @@ def _sigmas(local: LocalMap, intrinsics: Intrinsics) -> FloatArray:
     for keyframe in local.keyframes:
         tracks = keyframe.track_ids[local.known(keyframe.track_ids)]
         depth_sigmas = np.maximum(pixel / np.maximum(parallax.angle[tracks], 1e-6), _POINT_SIGMA)
-        sigmas.append(
-            1.0
-            / np.sqrt(
-                max(_INDEPENDENT * float((depth_sigmas**-2.0).sum()) / max(len(tracks), 1), 1e-9)
-            )
-        )
+        weight = _INDEPENDENT * float((depth_sigmas**-2.0).sum()) / max(len(tracks), 1)
+        sigmas.append(1.0 / np.sqrt(max(weight, 1e-9)))
         parallax.see(keyframe.T_camera_world, tracks)
     return np.array(sigmas[1:])
 
@@ -191,7 +222,8 @@ def join(
         intrinsics: of all images.
 
     Returns:
-        The map, and for each of ``shared`` the ratio of its corners that the adjustment left in one point.
+        The map, and for each of ``shared`` the ratio of its corners that the adjustment left in one
+        point.
     """
     ends = np.cumsum([len(segment.keyframes) for segment in segments])[:-1]
     parts = zip(segments, np.split(T_world_camera, ends), np.split(scales, ends), strict=True)
@@ -216,18 +248,23 @@ def join(
         )
     kept_ratios = []
     for earlier, later, corners in shared:
-        seen = [
-            np.isin(tracks[keyframes[row].track_ids[rows]], joined.keyframes[row].track_ids)
-            for row, rows in zip((earlier, later), corners.T, strict=True)
-        ]
-        kept_ratios.append(float(np.mean(seen[0] & seen[1])))
+        kept = np.ones(len(corners), np.bool_)
+        for row, rows in zip((earlier, later), corners.T, strict=True):
+            of_corners = tracks[keyframes[row].track_ids[rows]]
+            kept &= np.isin(of_corners, joined.keyframes[row].track_ids)
+        kept_ratios.append(float(np.mean(kept)))
     return joined, kept_ratios
 
 
 def moved(segment: LocalMap, T_world_camera: FloatArray, scales: FloatArray) -> LocalMap:
-    """A map by new poses ``(K, 4, 4)`` and units ``(K,)`` of its keyframes.
+    """A map by new poses and units of its keyframes.
 
     Points follow the first keyframe that sees them, frames the last keyframe before them.
+
+    Args:
+        segment: stays as it is.
+        T_world_camera: the new poses ``(K, 4, 4)``.
+        scales: units of that world per unit of the map, at each keyframe ``(K,)``.
     """
     points = np.full_like(segment.points, np.nan)
     for keyframe, T, scale in reversed(
@@ -256,16 +293,16 @@ def _united(segments: Sequence[LocalMap]) -> LocalMap:
     """The maps in one, with tracks numbered one map after the other."""
     keyframes: list[TrackedKeyframe] = []
     frames: list[TrackedFrame] = []
+    turns: list[RelativePose] = []
     first = 0
     for segment in segments:
-        keyframes += [
-            replace(keyframe, track_ids=keyframe.track_ids + first)
-            for keyframe in segment.keyframes
-        ]
-        frames += [replace(frame, track_ids=frame.track_ids + first) for frame in segment.frames]
+        for keyframe in segment.keyframes:
+            keyframes.append(replace(keyframe, track_ids=keyframe.track_ids + first))
+        for frame in segment.frames:
+            frames.append(replace(frame, track_ids=frame.track_ids + first))
         first += len(segment.points)
+        turns += segment.turns
     points = np.concatenate([segment.points for segment in segments])
-    turns = [turn for segment in segments for turn in segment.turns]
     return LocalMap(keyframes, points, frames, True, turns)
 
 

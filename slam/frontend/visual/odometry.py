@@ -1,11 +1,13 @@
 """Relative poses from optical flow: rotation and direction from corners, length from learned depth.
 
-As in DF-VO (Zhan et al. 2020): an essential matrix where the parallax determines one, its length from the
-ratio of learned to triangulated depth; perspective-n-point against learned depth where it does not.
+As in DF-VO (Zhan et al. 2020): an essential matrix where the parallax determines one, its length
+from the ratio of learned to triangulated depth; perspective-n-point against learned depth where it
+does not.
 
-Learned depth, the dynamic mask and the motion prior are learned from the steps before: one wrong step teaches them to
-find the next one wrong too. So a step that loses a third of its inliers, or has a length that no car reaches, is
-estimated again from corners alone, and the road, the steps before and a car's acceleration vote between both.
+Learned depth, the dynamic mask and the motion prior are learned from the steps before: one wrong
+step teaches them to find the next one wrong too. So a step that loses a third of its inliers, or
+has a length that no car reaches, is estimated again from corners alone, and the road, the steps
+before and a car's acceleration vote between both.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ from slam.frames import (
     trusted_depth,
 )
 from slam.frontend.tracking import CornerTracker, PredictedFlow, Tracks
-from slam.frontend.visual.motion import Motion, MotionHistory, RelativeRotation, pose_sigmas
+from slam.frontend.visual.history import MotionHistory
+from slam.frontend.visual.motion import Motion, RelativeRotation, pose_sigmas
 from slam.frontend.visual.self_calibration import DepthError, FocalLength
 from slam.frontend.visual.two_view import (
     CORNER_CORRELATION,
@@ -69,16 +72,15 @@ _LEARNED_LENGTH_RELATIVE_SIGMA = 0.05
 # least rotation sigma of a standing camera and of PnP
 _LEAST_ROTATION_SIGMA = np.deg2rad(0.01)
 _REPROJECTION_PX = 2.0  # largest reprojection error of a PnP inlier, pixels
-_ROAD_TOLERANCE = (
-    0.2  # largest deviation of a corner on the road from the camera's height, in camera heights
-)
+# largest deviation of a corner on the road from the camera's height, in camera heights
+_ROAD_TOLERANCE = 0.2
 _STILL_FLOW_PX = 0.3  # median optical flow below which the camera stands still, pixels
 _MOST_STILL_FLOW_PX = 1.0  # of a corner of the world before a camera that stands still, pixels
 _MIN_PARALLAX_PX = 0.8  # least median optical flow that remains after rotation is removed, pixels
 _MIN_POINT_PARALLAX_PX = 2.0  # least parallax of a point used for step lengths, pixels
 _ROTATION_FLOOR_DEG = 0.002  # least rotation sigma, degrees
-# corners are measured in images of a megapixel at most: larger ones are no sharper, their pixels have more noise and
-# less contrast, corners crowd on few objects, and the time grows with them
+# corners are measured in images of a megapixel at most: larger ones are no sharper, their pixels
+# have more noise and less contrast, corners crowd on few objects, and the time grows with them
 _MOST_PIXELS = 1e6
 _DIRECTION_FLOOR_DEG = 0.045  # least sigma of the translation direction, degrees
 # largest log of a length over the same by the road or by triangulated points
@@ -90,7 +92,8 @@ _LEAST_COMMON = 12  # points by which two steps compare their lengths
 class VisualOdometry:
     """Measures ``T_previous_current`` between frames of one sequence, in the unscaled unit of depth.
 
-    ``depth_error`` is that of learned depth and ``focal_length`` the one that corners show, by the steps so far.
+    ``depth_error`` is that of learned depth and ``focal_length`` the one that corners show, by the
+    steps so far.
     """
 
     def __init__(self, intrinsics: Intrinsics, seed: int = 0) -> None:
@@ -109,8 +112,8 @@ class VisualOdometry:
         self._history = MotionHistory()
         self._last: Motion | None = None  # to the last frame, where one was measured
         self._points: TriangulatedPoints | None = None  # by the last motion that corners alone gave
-        # tracks that fitted the last motion have the vote on the next one: what passes between the camera and the
-        # world never did, however many corners it has
+        # tracks that fitted the last motion have the vote on the next one: what passes between the
+        # camera and the world never did, however many corners it has
         self._fitted: NDArray[np.int64] = np.zeros(0, np.int64)
 
     def measure(
@@ -129,12 +132,14 @@ class VisualOdometry:
             depth_previous_unscaled: learned z-depth ``(H, W)`` of the earlier frame.
             height_unscaled: camera height in the same unit; where known, depths of more than
                 30 times as much are not trusted.
-            standing: pixels ``(h, w)`` that do not show the world, of images of any size; None where all do.
+            standing: pixels ``(h, w)`` that do not show the world, of images of any size; None
+                where all do.
         """
         previous, current = self._reduced(previous), self._reduced(current)
         depth_previous_unscaled = self._reduced_depth(depth_previous_unscaled)
         last, flow = self._last, None
-        # by the constant-velocity model, if the last motion ended at the earlier frame and spans as many frames
+        # by the constant-velocity model, if the last motion ended at the earlier frame and spans as
+        # many frames
         if last is not None and last.ends == (2 * previous.index - current.index, previous.index):
             flow = PredictedFlow.of(
                 last.relative_pose.T_from_to, depth_previous_unscaled, self._intrinsics
@@ -171,7 +176,8 @@ class VisualOdometry:
         """Prepare to measure the rotation between two frames some steps apart, whose motion is about ``T_first_last``.
 
         Returns:
-            A function that measures it from the present state, in any thread; its result is None with too few corners.
+            A function that measures it from the present state, in any thread; its result is None
+            with too few corners.
         """
         first, last = self._reduced(first), self._reduced(last)
         depth_first_unscaled = self._reduced_depth(depth_first_unscaled)
@@ -253,7 +259,8 @@ class VisualOdometry:
             tracks, votes, learned, height, self._dynamic_mask, self.depth_error
         )
         rays_previous, rays_current = matches.rays_previous[votes], matches.rays_current[votes]
-        # the translation of an essential matrix is arbitrary under pure rotation: only used with enough parallax
+        # the translation of an essential matrix is arbitrary under pure rotation: only used with
+        # enough parallax
         R_current_previous = rotation_between(rays_previous, rays_current)
         unexplained = parallax_px(rays_previous, rays_current, R_current_previous, self._focal)
         if np.median(unexplained) < _MIN_PARALLAX_PX:
@@ -412,7 +419,8 @@ class VisualOdometry:
 class TriangulatedPoints:
     """``M`` scene points that a step triangulated, by the identifiers of their tracks ``track_ids`` ``(M,)``.
 
-    z-depths ``(M,)`` in both cameras are in units of the step's length, ``relative_sigma`` ``(M,)`` is that of both.
+    z-depths ``(M,)`` in both cameras are in units of the step's length, ``relative_sigma`` ``(M,)``
+    is that of both.
     """
 
     track_ids: NDArray[np.int64]
@@ -423,7 +431,8 @@ class TriangulatedPoints:
     def length_ratio(self, earlier: TriangulatedPoints) -> tuple[float, float] | None:
         """Log of this step's length over that of an earlier one that ends where this begins, with its sigma.
 
-        In the frame between, a point's depth is ``|t| z`` by either step; None with too few common points.
+        In the frame between, a point's depth is ``|t| z`` by either step; None with too few common
+        points.
         """
         _, first, second = np.intersect1d(
             earlier.track_ids, self.track_ids, assume_unique=True, return_indices=True
@@ -464,7 +473,19 @@ def most_credible(
     seconds: float,
     history: MotionHistory,
 ) -> Step | None:
-    """The step with most votes, the first of equal ones; None where more votes are against each than for it."""
+    """The step with most votes, the first of equal ones.
+
+    Args:
+        steps: estimates of one step; None for those that failed.
+        matches: corners in both images.
+        height_unscaled: of the camera above the road, in the unit of learned depth; None if
+            unknown.
+        seconds: between both frames.
+        history: of the steps before.
+
+    Returns:
+        None where more votes are against each than for it.
+    """
     estimated = [step for step in steps if step is not None]
     balance = []
     for step in estimated:
@@ -486,7 +507,8 @@ def most_credible(
             depth = triangulated_depth(rays, matches.rays_current[road], step.two_view.unit_pose)
             height = float(np.median(depth * rays[:, 1])) * step.motion.length_unscaled
             votes.append(bool(abs(np.log(max(height, 1e-9) / height_unscaled)) < _AGREEMENT))
-        # the direction is about the median of the last hundred steps, which a few wrong ones do not change
+        # the direction is about the median of the last hundred steps, which a few wrong ones do not
+        # change
         prior = history.prior()
         if np.isfinite(prior.axis_sigma):
             votes.append(prior.deviation(step.two_view.unit_pose.direction) < 3.0)

@@ -1,12 +1,14 @@
 """What the corners of a drive show of its error of learned depth over distance, and of the focal length that is stated.
 
-Networks see far things too near, and err more the farther they are: on streets that they were not trained on by a third
-beyond 40 m. One scale for all distances would then depend on whether most corners are near or far. So the logarithm of
-learned over triangulated depth is counted by learned depth; its median is the bias that is taken out before depth is
-compared with anything, its spread without that of triangulation the sigma (``docs/design/visual-front-end.md``).
+Networks see far things too near, and err more the farther they are: on streets that they were not
+trained on by a third beyond 40 m. One scale for all distances would then depend on whether most
+corners are near or far. So the logarithm of learned over triangulated depth is counted by learned
+depth; its median is the bias that is taken out before depth is compared with anything, its spread
+without that of triangulation the sigma (``docs/design/visual-front-end.md``).
 
-Under a wrong focal length no motion explains the corners of a camera that turns: the essential matrix of wrong rays has
-two singular values that differ (Hartley and Zisserman 2004, section 9.6). A camera that goes straight on shows nothing.
+Under a wrong focal length no motion explains the corners of a camera that turns: the essential
+matrix of wrong rays has two singular values that differ (Hartley and Zisserman 2004, section 9.6).
+A camera that goes straight on shows nothing.
 """
 
 from __future__ import annotations
@@ -38,16 +40,16 @@ _USUAL_SIGMA = 0.15
 _USUAL_FAR_SIGMA = 0.25
 _FOCAL_STEP = 0.01  # of the logarithm, for its derivative
 _LEAST_SIGMA_PX = 1e-3
-_CORRELATION = (
-    4.0  # of the errors of corners, and of those that flow makes where a camera hardly turns
-)
+# of the errors of corners, and of those that flow makes where a camera hardly turns
+_CORRELATION = 4.0
 
 
 @dataclass(frozen=True, eq=False)
 class DepthError:
     """Corners of the last steps by learned depth and by log of learned over triangulated depth ``(D, L)``, decayed.
 
-    Those that triangulation hardly measures count less. ``noise`` ``(D,)`` is the sum of its sigmas.
+    Those that triangulation hardly measures count less. ``noise`` ``(D,)`` is the sum of its
+    sigmas.
     """
 
     corners: FloatArray = field(default_factory=lambda: np.zeros((len(_DEPTHS), len(_LOGARITHMS))))
@@ -86,13 +88,14 @@ class DepthError:
 
         Args:
             learned: depth ``(M,)`` of corners on their epipolar lines, NaN where unknown.
-            nearness: 1 over triangulated depth ``(M,)`` in units of the motion's length, without bias; 0 or less beyond
-                infinity.
+            nearness: 1 over triangulated depth ``(M,)`` in units of the motion's length, without
+                bias; 0 or less beyond infinity.
             sigma: of it ``(M,)``.
             length: of the motion, in the unit of learned depth.
         """
         known = np.isfinite(learned)
-        ratio, spread = (learned[known] * values[known] / length for values in (nearness, sigma))
+        ratio = learned[known] * nearness[known] / length
+        spread = learned[known] * sigma[known] / length
         weights = 1.0 / (1.0 + (spread / _USUAL_SIGMA) ** 2)
         corners, noise = _KEPT * self.corners, _KEPT * self.noise
         depths = _nearest(np.log2(learned[known]), np.log2(_DEPTHS))
@@ -125,8 +128,8 @@ class DepthError:
     def bias(self) -> FloatArray:
         """Log of learned over true depth at each of ``_DEPTHS`` ``(D,)``.
 
-        It is zero on the average of what corners tell of a length, which they do by the square of their parallax: near
-        depth, as that of the road, keeps its unit.
+        It is zero on the average of what corners tell of a length, which they do by the square of
+        their parallax: near depth, as that of the road, keeps its unit.
         """
         median = self._quantile(0.5)
         weights = self.corners.sum(axis=1) / (self._spread * _DEPTHS) ** 2
@@ -185,7 +188,8 @@ class FocalLength:
     ) -> Self:
         """After one more step, whose rotation and direction are eliminated.
 
-        By the rays ``(M, 3)``, z = 1, of corners on their epipolar lines; ``focal_px`` is the stated focal length.
+        By the rays ``(M, 3)``, z = 1, of corners on their epipolar lines; ``focal_px`` is the
+        stated focal length.
         """
         tangent, unknown = tangent_of(unit_pose.direction), np.full(len(rays_previous), np.nan)
 

@@ -1,12 +1,14 @@
 """The motion between two views from corners, learned depth and the motion prior of the drive.
 
-Corners alone are ambiguous (``docs/design/visual-front-end.md``). Two further measurements resolve this: the shift of
-each corner along its epipolar line, which learned depth predicts too; and the usual direction of motion. Residuals of
-corners are across and along these lines. Where many corners were outliers recently, the others are weighted down.
+Corners alone are ambiguous (``docs/design/visual-front-end.md``). Two further measurements resolve
+this: the shift of each corner along its epipolar line, which learned depth predicts too; and the
+usual direction of motion. Residuals of corners are across and along these lines. Where many corners
+were outliers recently, the others are weighted down.
 
-A car that drives along keeps its corners on their epipolar lines. Learned depth is believed against them only about a
-region as an object has it: connected, of one motion, and without the majority of the road; and about all such regions
-together only where they do not hold the majority of the image's parallax.
+A car that drives along keeps its corners on their epipolar lines. Learned depth is believed against
+them only about a region as an object has it: connected, of one motion, and without the majority of
+the road; and about all such regions together only where they do not hold the majority of the
+image's parallax.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frontend.visual.motion import AXIS_SIGMA, MotionHistory, MotionPrior
+from slam.frontend.visual.history import AXIS_SIGMA, MotionHistory, MotionPrior
 from slam.geometry.multiview import (
     UnitRelativePose,
     cross,
@@ -43,12 +45,13 @@ _RESECTION_PX = 2.0
 _COMPARABLE_SUPPORT = 0.6
 # inlier bound along the epipolar line, sigmas
 _ALONG_SIGMAS = 2.5
-# parallax of a corner that is an inlier against its learned depth, in sigmas of the corners' noise: triangulated to a
-# twentieth, four times as well as learned depth is known at best
+# parallax of a corner that is an inlier against its learned depth, in sigmas of the corners' noise:
+# triangulated to a twentieth, four times as well as learned depth is known at best
 _PARALLAX_SIGMAS = 20.0
 # an outlier costs as much as this half-squared residual
 _OUTLIER_COST = 3.0
-# errors of learned depth are correlated in patches: its sigma is widened by this near a known motion
+# errors of learned depth are correlated in patches: its sigma is widened by this near a known
+# motion
 _PATCH_WIDENING = 3.0
 # errors of neighbouring corners are correlated: sigmas of independent ones are widened by this
 CORNER_CORRELATION = 2.0
@@ -63,9 +66,8 @@ _HATS = np.array(
 )
 _CELL_PX = 8.0
 _SPREAD_CELLS = 1.5
-_SHARPNESS = (
-    4.0  # power of a cell's inlier ratio over that of the whole image, by which corners weigh
-)
+# power of a cell's inlier ratio over that of the whole image, by which corners weigh
+_SHARPNESS = 4.0
 # decay a step: a half-life of seven steps
 _KEPT = 0.9
 # weight, in corners, of the prior that a cell has the inlier ratio of the whole image
@@ -81,9 +83,10 @@ _CONSISTENCY = 0.5
 class Matches:
     """``M`` corners in two images: rays ``(M, 3)`` with z = 1 in both, learned ``depth_previous`` ``(M,)`` or NaN.
 
-    Learned depth is without its bias and has the relative ``depth_sigma`` ``(M,)``; by it the corners ``on_road``
-    ``(M,)`` lie at the height of the road. ``weights`` ``(M,)`` in (0, 1] are lower on dynamic objects. The motion that
-    most of those with ``votes`` ``(M,)`` agree on is chosen. ``focal_px`` is the focal length, pixels.
+    Learned depth is without its bias and has the relative ``depth_sigma`` ``(M,)``; by it the
+    corners ``on_road`` ``(M,)`` lie at the height of the road. ``weights`` ``(M,)`` in (0, 1] are
+    lower on dynamic objects. The motion that most of those with ``votes`` ``(M,)`` agree on is
+    chosen. ``focal_px`` is the focal length, pixels.
     """
 
     rays_previous: FloatArray
@@ -131,9 +134,9 @@ class Matches:
 class TwoViewEstimate:
     """A ``unit_pose`` with its noise and support.
 
-    ``covariance`` ``(6, 6)``: rotation then direction, both in the current camera, radians. ``noise_px`` is the sigma
-    of corners about their epipolar lines.
-    ``inliers`` ``(M,)`` marks the corners that fit it, ``agreeing`` ``(M,)`` those whose learned depth fits it too.
+    ``covariance`` ``(6, 6)``: rotation then direction, both in the current camera, radians.
+    ``noise_px`` is the sigma of corners about their epipolar lines. ``inliers`` ``(M,)`` marks the
+    corners that fit it, ``agreeing`` ``(M,)`` those whose learned depth fits it too.
     """
 
     unit_pose: UnitRelativePose
@@ -144,7 +147,16 @@ class TwoViewEstimate:
 
 
 def estimate(matches: Matches, history: MotionHistory, seed: int = 0) -> TwoViewEstimate | None:
-    """Rotation and direction of the next motion; None without a consensus. ``seed`` is that of RANSAC."""
+    """Rotation and direction of the next motion.
+
+    Args:
+        matches: corners in both images.
+        history: of the steps before, of which the last motion and the usual direction are tried.
+        seed: of RANSAC.
+
+    Returns:
+        None without a consensus.
+    """
     votes, prior, least = matches.votes, history.prior(), _EARLY_EXIT_INLIER_RATIO
     usual = _refined(matches, history.last, prior)
     if usual is not None and usual.agreeing[votes].mean() >= least:
@@ -181,9 +193,10 @@ def _refined(
 ) -> TwoViewEstimate | None:
     """Gauss-Newton with Cauchy weights over rotation, direction and the length in the unit of learned depth.
 
-    Across its epipolar line a corner has the noise of the image, along it that of learned depth. A corner with
-    parallax is an inlier whatever its learned depth says: its own shift is the better measurement. Without parallax
-    the corner is far away or moves along with the camera, which learned depth alone can tell apart.
+    Across its epipolar line a corner has the noise of the image, along it that of learned depth. A
+    corner with parallax is an inlier whatever its learned depth says: its own shift is the better
+    measurement. Without parallax the corner is far away or moves along with the camera, which
+    learned depth alone can tell apart.
     """
     if start is None:
         return None
@@ -239,10 +252,10 @@ def _inliers(
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which corners near their epipolar lines fit learned depth ``(M,)``, and which are inliers ``(M,)``.
 
-    The majority of the parallax in the image decides on the length by which learned depth is compared, not the
-    majority of corners: those far away are many at times, and their depth is the least certain. Shifts ``(M,)``
-    along the lines are ``shift_px`` by learned depth and ``seen_px``; larger ones than ``parallax_px`` are inliers
-    against it.
+    The majority of the parallax in the image decides on the length by which learned depth is
+    compared, not the majority of corners: those far away are many at times, and their depth is the
+    least certain. Shifts ``(M,)`` along the lines are ``shift_px`` by learned depth and
+    ``seen_px``; larger ones than ``parallax_px`` are inliers against it.
     """
     known = np.isfinite(matches.depth_previous)
     measured = near & known & (seen_px > 1.0) & (shift_px > 0)
@@ -280,8 +293,9 @@ def _support(candidate: TwoViewEstimate, votes: NDArray[np.bool_], prior: Motion
 class Residuals:
     """Residuals of ``M`` corners in two images, in pixels.
 
-    Derivatives ``(5, M)`` are by rotation, in the current camera, and by the direction along both axes of its
-    ``tangent`` ``(3, 2)``; a sixth is by the length. Arrays are coordinate-major, which is several times faster.
+    Derivatives ``(5, M)`` are by rotation, in the current camera, and by the direction along both
+    axes of its ``tangent`` ``(3, 2)``; a sixth is by the length. Arrays are coordinate-major, which
+    is several times faster.
     """
 
     def __init__(
@@ -306,8 +320,8 @@ class Residuals:
     ) -> tuple[FloatArray, FloatArray]:
         """Sampson distances ``(M,)`` and their derivatives ``(5, M)`` (Hartley and Zisserman 2004, Eq. 11.9).
 
-        The gradient's norm changes with the motion too. Held fixed, as reweighted least squares do, it biases the
-        motion by the square of the corners' noise.
+        The gradient's norm changes with the motion too. Held fixed, as reweighted least squares do,
+        it biases the motion by the square of the corners' noise.
         """
         # E = hat(t) R and its five derivatives
         essential = np.empty((6, 3, 3))
@@ -316,7 +330,8 @@ class Residuals:
         essential[4:] = (tangent.T @ _HATS).reshape(2, 3, 3)
         essential = essential @ unit_pose.R_current_previous
         algebraic = essential.reshape(6, 9) @ self._both
-        # squared lengths of E x and E^T x' without their last coefficients, and half their derivatives
+        # squared lengths of E x and E^T x' without their last coefficients, and half their
+        # derivatives
         lines_current = essential[:, :2].swapaxes(1, 2) @ essential[0, :2]
         lines_previous = essential[:, :, :2] @ essential[0, :, :2].T
         squares = lines_current.reshape(6, 9) @ self._previous_twice
@@ -331,7 +346,8 @@ class Residuals:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Distances ``(M,)`` along the epipolar lines from the points predicted by learned depth.
 
-        Also their derivatives ``(6, M)``, and the shift along the line predicted by learned depth ``(M,)``.
+        Also their derivatives ``(6, M)``, and the shift along the line predicted by learned depth
+        ``(M,)``.
         """
         rotated = unit_pose.R_current_previous @ self._previous
         points = (
@@ -418,7 +434,8 @@ def moving_corners(
     Args:
         pixels: ``(M, 2)``, of any origin.
         on_road: corners that learned depth puts on the road ``(M,)``.
-        agreeing: corners on their epipolar lines whose shift along them is as learned depth has it ``(M,)``.
+        agreeing: corners on their epipolar lines whose shift along them is as learned depth has it
+            ``(M,)``.
         contradicting: those on their lines whose shift is another ``(M,)``.
         expected_px: the shift by learned depth ``(M,)``.
         seen_px: the shift along the line ``(M,)``, negative away from it.

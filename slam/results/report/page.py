@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from erfsfm.common.readers.images import resize_image
 from slam.formats.trajectory import Trajectory
 from slam.frames import Image, Intrinsics
-from slam.loops.recognition import Loop
+from slam.loops.verification import Loop
 from slam.mapping.depth import KeyframeDepth
 from slam.results import tables
 from slam.results.folder import RunFolder

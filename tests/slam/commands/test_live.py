@@ -141,7 +141,7 @@ def test_without_a_road_there_are_no_metres_and_no_camera_heights(
     unit: str | None,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("slam.frontend.road._ROAD_ROWS", (0.0, 0.001))  # at the horizon
+    monkeypatch.setattr("slam.frontend.ground_plane._ROAD_ROWS", (0.0, 0.001))  # at the horizon
     monkeypatch.setattr("slam.frontend.road._MIN_POINTS", 10**6)  # of the homography
     target, messages = filled(street, tmp_path)
     settings = (*SETTINGS, f"scale.mode={mode}")

@@ -18,8 +18,8 @@ from slam.config.sections import dump_yaml, load_config
 from slam.formats.trajectory import Trajectory, associate, read_trajectory, write_kitti
 from slam.frames import Frame, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
+from slam.loops.features import FeatureExtractor
 from slam.loops.places import Places
-from slam.loops.recognition import FeatureExtractor
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
 from slam.runtime.files import PLACES

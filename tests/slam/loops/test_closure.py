@@ -12,10 +12,10 @@ from oracle import OracleNoise, OraclePredictor
 
 from slam.config.sections import LoopsConfig, load_config
 from slam.evaluation.trajectory import trajectory_metrics
-from slam.frames import LOOP_SOURCE, Frame, Intrinsics, RelativePose, View
+from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose, View
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert, rotation_angle
-from slam.loops.closure import MOST_REJECTED, Track, agreeing, close_loops
-from slam.loops.recognition import OF_FRAMES, FeatureExtractor, Loop
+from slam.loops.closure import MOST_REJECTED, Apart, Track, agreeing, close_loops, find_candidates
+from slam.loops.verification import OF_FRAMES, Loop
 from slam.pipeline import observer
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import SlamPipeline
@@ -153,21 +153,6 @@ def test_a_straight_drive_has_no_loop() -> None:
     assert result.loops.accepted == () and result.loops.candidates > 0
 
 
-def test_features_are_spread_and_bounded() -> None:
-    sequence = Drive("straight", 10, 621)
-    extractor = FeatureExtractor(sequence.intrinsics)
-    depth = sequence.render(3).depth
-    view = extractor.view(sequence.frame(3), depth, height_unscaled=sequence.camera_height_m)
-    assert 100 < len(view) <= 500 and view.descriptors.shape == (len(view), 32)
-    known = np.isfinite(view.points).all(axis=1)
-    assert known.any() and view.points[known, 2].max() < 30 * sequence.camera_height_m
-    again = view.points[known] / view.points[known, 2:] @ sequence.intrinsics.K.T
-    np.testing.assert_allclose(again[:, :2], view.pixels[known], atol=1e-3)
-    assert view.pixels[:, 0].std() > 0.15 * SIZE[0]
-    blank = extractor.view(Frame(4, 0.4, np.full((SIZE[1], SIZE[0], 3), 90, np.uint8)), depth)
-    assert len(blank) == 0
-
-
 def ring(yaw_error: float = 0.0) -> FloatArray:
     """Once and a quarter round a circle of 200 frames, one metre a frame."""
     vector = np.tile([0.0, 2 * np.pi / 200 + yaw_error, 0.0], (249, 1))
@@ -228,3 +213,64 @@ def test_a_loop_between_maps_may_not_contradict_the_motion_between_them() -> Non
     unsure = track.path + 300.0 * maps
     assert len(agreeing(far, replace(track, maps=maps, path=unsure), OF_FRAMES)[0]) == 1
     assert len(agreeing(far, replace(track, maps=maps, worlds=maps), OF_FRAMES)[0]) == 1
+
+
+def place(rng: np.random.Generator) -> np.ndarray:
+    return rng.integers(0, 256, (80, 32), dtype=np.uint8)
+
+
+def seen_again(descriptors: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The same corners with a few bits flipped, in another order."""
+    bits = np.unpackbits(descriptors, axis=1) ^ (rng.random((len(descriptors), 256)) < 0.04)
+    return rng.permutation(np.packbits(bits, axis=1))
+
+
+def view(index: int, descriptors: np.ndarray) -> View:
+    count = len(descriptors)
+    return View(
+        index,
+        np.zeros((count, 2), np.float32),
+        descriptors,
+        np.full((count, 3), np.nan, np.float32),
+    )
+
+
+def drive(places: int, again: int) -> list[View]:
+    """Each place has two frames; after ``places`` new ones the first ``again`` are revisited."""
+    rng = np.random.default_rng(0)
+    known = [place(rng) for _ in range(places)]
+    order = [*range(places), *range(again)]
+    return [
+        view(2 * k + j, seen_again(known[p], rng)) for k, p in enumerate(order) for j in range(2)
+    ]
+
+
+def apart(path: np.ndarray) -> Apart:
+    """Thirty frames and fifteen metres."""
+    frames = np.arange(len(path))
+    return lambda rows: (frames[rows, None] - frames >= 30) & (path[rows, None] - path >= 15.0)
+
+
+def test_revisited_places_are_found() -> None:
+    views = drive(20, 5)
+    found = find_candidates(views, apart(np.arange(50.0)), OF_FRAMES)
+    best = {}
+    for candidate in found:
+        best.setdefault(candidate.later, candidate)
+    for later in range(40, 50):
+        assert best[later].earlier // 2 == (later - 40) // 2
+        assert best[later].score > 0.5
+    assert all(views[c.later].index - views[c.earlier].index >= 30 for c in found)
+
+
+@pytest.mark.parametrize("path_m", [np.zeros(50), np.linspace(0.0, 4.0, 50)])
+def test_a_standing_camera_finds_nothing(path_m: np.ndarray) -> None:
+    assert find_candidates(drive(20, 5), apart(path_m), OF_FRAMES) == []
+
+
+def test_candidates_are_few_and_apart() -> None:
+    found = find_candidates(drive(20, 5), apart(np.arange(50.0)), OF_FRAMES)
+    for later in {c.later for c in found}:
+        earlier = [c.earlier for c in found if c.later == later]
+        assert len(earlier) <= 2
+        assert len(earlier) < 2 or abs(earlier[0] - earlier[1]) > 10

@@ -13,7 +13,7 @@ import room
 from oracle import OracleNoise, OraclePredictor
 
 from slam.config.sections import load_config
-from slam.loops.recognition import FeatureExtractor
+from slam.loops.features import FeatureExtractor
 from slam.mapping.depth import DepthRefiner
 from slam.mapping.submap import Fusion
 from slam.pipeline.run import SlamPipeline

@@ -29,7 +29,7 @@ from slam.geometry.se3 import (
     umeyama,
 )
 from slam.loops.closure import LoopClosures, Track, find_loops
-from slam.loops.recognition import Loop
+from slam.loops.verification import Loop
 from slam.pipeline import keyframe_maps
 from slam.pipeline.keyframe_maps import FrontEnd, KeyframeTracking, MapClosure, choose, close_maps
 from slam.pipeline.observer import Observer

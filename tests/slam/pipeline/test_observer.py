@@ -17,8 +17,8 @@ from slam.config.sections import SlamConfig, load_config
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import Frame
 from slam.frontend import tracking
-from slam.frontend.completion import INTERPOLATED_SOURCE
 from slam.frontend.drive import Drive
+from slam.frontend.gaps import INTERPOLATED_SOURCE
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.observer import Observer

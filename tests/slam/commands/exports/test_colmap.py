@@ -12,8 +12,8 @@ from slam.commands.export import export
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame
 from slam.geometry.se3 import FloatArray, apply, invert
+from slam.loops.features import FeatureExtractor
 from slam.loops.places import Places
-from slam.loops.recognition import FeatureExtractor
 from slam.results.folder import RunFolder
 from slam.runtime.files import PLACES
 from slam.sequences.catalogue import SimulatedSequence

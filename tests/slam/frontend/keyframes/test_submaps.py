@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from slam.frames import Intrinsics
+from slam.frontend.keyframes.learned_units import learned_unit
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
-from slam.frontend.keyframes.relative_poses import keyframe_poses, learned_unit
+from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.keyframes.submaps import parts_of
 from slam.geometry.se3 import FloatArray, apply, from_rotation_vector, invert, rotation_angle
 

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from slam.frames import Frame, Intrinsics
-from slam.frontend.visual.motion import Motion, MotionHistory
+from slam.frontend.visual.history import MotionHistory
+from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import VisualOdometry
 from slam.frontend.visual.two_view import (
     DEPTH_RELATIVE_SIGMA,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from slam.formats.trajectory import Trajectory
 from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose
-from slam.loops.recognition import Loop
+from slam.loops.verification import Loop
 from slam.mapping.depth import KeyframeDepth
 from slam.results.folder import RunFolder
 from slam.results.report.figures import MapView

@@ -1,3 +1,5 @@
+"""Loops between two views of drawn points are verified, measured and refused."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -7,9 +9,8 @@ import pytest
 
 from slam.frames import LOOP_SOURCE, Intrinsics, View
 from slam.geometry.se3 import FloatArray, apply, from_rotation_vector, invert, rotation_angle
-from slam.loops import recognition
-from slam.loops.closure import Apart, find_candidates
-from slam.loops.recognition import OF_FRAMES, Loop, LoopVerifier, RejectedLoop, hamming
+from slam.loops import verification
+from slam.loops.verification import OF_FRAMES, Loop, LoopVerifier, RejectedLoop
 
 CAMERA = Intrinsics(width=416, height=128, fx=240.0, fy=240.0, cx=207.5, cy=63.5)
 T_A_B = from_rotation_vector(np.array([0.01, 0.08, -0.02]), np.array([0.7, 0.1, 2.0]))
@@ -76,7 +77,7 @@ def test_verdict_does_not_depend_on_the_unit(unit: float) -> None:
 def test_sigmas_grow_with_the_error_of_corners_and_cover_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(recognition, "_LENGTH_RELATIVE_SIGMA", 1e-6)
+    monkeypatch.setattr(verification, "_LENGTH_RELATIVE_SIGMA", 1e-6)
     whitened, sizes = [], []
     for sigma_px in (0.3, 1.0):
         for seed in range(12):
@@ -120,71 +121,3 @@ def test_directions_that_disagree_are_refused() -> None:
     verdict = verify(earlier, later.scaled(1.6))
     assert isinstance(verdict, RejectedLoop) and "both directions differ" in verdict.reason
     assert verdict.inliers > 100
-
-
-def place(rng: np.random.Generator) -> np.ndarray:
-    return rng.integers(0, 256, (80, 32), dtype=np.uint8)
-
-
-def seen_again(descriptors: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The same corners with a few bits flipped, in another order."""
-    bits = np.unpackbits(descriptors, axis=1) ^ (rng.random((len(descriptors), 256)) < 0.04)
-    return rng.permutation(np.packbits(bits, axis=1))
-
-
-def view(index: int, descriptors: np.ndarray) -> View:
-    count = len(descriptors)
-    return View(
-        index,
-        np.zeros((count, 2), np.float32),
-        descriptors,
-        np.full((count, 3), np.nan, np.float32),
-    )
-
-
-def drive(places: int, again: int) -> list[View]:
-    """Each place has two frames; after ``places`` new ones the first ``again`` are revisited."""
-    rng = np.random.default_rng(0)
-    known = [place(rng) for _ in range(places)]
-    order = [*range(places), *range(again)]
-    return [
-        view(2 * k + j, seen_again(known[p], rng)) for k, p in enumerate(order) for j in range(2)
-    ]
-
-
-def apart(path: np.ndarray) -> Apart:
-    """Thirty frames and fifteen metres."""
-    frames = np.arange(len(path))
-    return lambda rows: (frames[rows, None] - frames >= 30) & (path[rows, None] - path >= 15.0)
-
-
-def test_hamming_counts_bits() -> None:
-    rng = np.random.default_rng(1)
-    first, second = place(rng), place(rng)[:50]
-    slow = np.unpackbits(first[:, None] ^ second[None], axis=2).sum(axis=2)
-    np.testing.assert_array_equal(hamming(first, second), slow)
-
-
-def test_revisited_places_are_found() -> None:
-    views = drive(20, 5)
-    found = find_candidates(views, apart(np.arange(50.0)), OF_FRAMES)
-    best = {}
-    for candidate in found:
-        best.setdefault(candidate.later, candidate)
-    for later in range(40, 50):
-        assert best[later].earlier // 2 == (later - 40) // 2
-        assert best[later].score > 0.5
-    assert all(views[c.later].index - views[c.earlier].index >= 30 for c in found)
-
-
-@pytest.mark.parametrize("path_m", [np.zeros(50), np.linspace(0.0, 4.0, 50)])
-def test_a_standing_camera_finds_nothing(path_m: np.ndarray) -> None:
-    assert find_candidates(drive(20, 5), apart(path_m), OF_FRAMES) == []
-
-
-def test_candidates_are_few_and_apart() -> None:
-    found = find_candidates(drive(20, 5), apart(np.arange(50.0)), OF_FRAMES)
-    for later in {c.later for c in found}:
-        earlier = [c.earlier for c in found if c.later == later]
-        assert len(earlier) <= 2
-        assert len(earlier) < 2 or abs(earlier[0] - earlier[1]) > 10

@@ -1,0 +1,178 @@
+"""Gaps of a drive, interpolated after its last frame.
+
+Frames without a measurement follow the constant-velocity model, with wide sigmas.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from slam.frames import RelativePose, SnippetPoses, runs
+from slam.frontend.drive import Drive
+from slam.frontend.factors import calibrate_network, equal_step, network_steps
+from slam.frontend.keyframes.relative_poses import NO_MAPS, KeyframePoses
+from slam.frontend.visual.motion import Motion, Steps
+from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert, tangent
+from slam.runtime.errors import SlamError
+
+INTERPOLATED_SOURCE = "interpolated"
+_STEPS_OF_A_MOTION = 3
+# the first step of a camera that stood, in steps before it stood
+_LONGEST_START = 2.0
+# frames without a usable image between a frozen video and the first new image
+_LONGEST_DOUBT = 2
+_SIGMA_FLOOR = 1e-6
+_ROTATION_SIGMA_DEG = 2.0  # rotation sigma of an interpolated step, degrees
+_TRANSLATION_RELATIVE_SIGMA = 0.5  # translation sigma over the length of an interpolated step
+
+
+def interpolate_gaps(
+    drive: Drive, sources: int, cuts: Collection[int] = (), map_poses: KeyframePoses = NO_MAPS
+) -> Drive:
+    """The drive with steps and snippets in its gaps, and without what was measured on interpolated frames.
+
+    Steps over a gap are between its two ends. No snippet measures across a cut.
+
+    Args:
+        drive: as it was collected.
+        sources: frames of a snippet besides its target.
+        cuts: frames that show another place than the frame before.
+        map_poses: poses by the maps of keyframes of the drive.
+
+    Raises:
+        SlamError: no snippet was measured, so there is no motion to extrapolate.
+    """
+    count = len(drive)
+    if not drive.snippets:
+        why = next(iter(drive.unusable.values()), "the sequence is too short")
+        raise SlamError(f"no {sources + 1} usable frames in a row among {count}: {why}")
+    new = set(range(count)).difference(drive.unusable, drive.repeated)
+    raw = network_steps(drive.snippets)
+    calibration = calibrate_network(raw, _poses(drive.steps), np.ones(count))
+    by_network = calibration.scaled(raw)
+    frozen, steps = _without_frozen(by_network, drive.steps, map_poses, drive.repeated, new)
+    frames = drive.unusable | dict.fromkeys(frozen, "the image stands still while the camera moves")
+    trusted = [snippet for snippet in drive.snippets if _is_trusted(snippet, frozen, cuts)]
+    by_image = {}
+    for (first, last), step in steps.items():
+        if last == first + 1:
+            by_image[first] = step.relative_pose.T_from_to
+    # snippets of frozen images alone are still the best estimate available
+    known = calibration.scaled(network_steps(trusted)) | by_image or by_network
+    covered = set(by_image)
+    for snippet in trusted:
+        covered.update(range(min(snippet.sources), max(snippet.sources)))
+    loose = [k for k in range(count - 1) if k not in covered]
+    motion = _completed(known, loose)
+    for pose in _poses(steps):  # over gaps
+        over = range(*pose.ends)
+        if len(over) > 1 and set(loose).issuperset(over):
+            motion |= dict.fromkeys(over, equal_step(pose.T_from_to, len(over)))
+    typical = float(np.median([np.linalg.norm(T[:3, 3]) for T in known.values()]))
+    return replace(
+        drive,
+        snippets=_filled(drive.snippets, _completed(raw, range(count - 1)), count, sources),
+        trusted=trusted,
+        motions=list(steps.values()),
+        interpolated=dict(sorted(frames.items())),
+        gap_steps=[_guess(k, motion[k], typical) for k in loose],
+        views=[view for view in drive.views if view.index not in frames],
+        keyframes=[keyframe for keyframe in drive.keyframes if keyframe.index not in frames],
+    )
+
+
+def _is_trusted(snippet: SnippetPoses, frozen: Collection[int], cuts: Collection[int]) -> bool:
+    """Whether a snippet sees no frozen frame and does not measure across a cut."""
+    span = {snippet.target, *snippet.sources}
+    return span.isdisjoint(frozen) and not any(min(span) < cut <= max(span) for cut in cuts)
+
+
+def _guess(k: int, T_k_next: FloatArray, typical: float) -> RelativePose:
+    """An interpolated step, whose sigmas are wide: by its length, or by a ``typical`` one."""
+    length = max(float(np.linalg.norm(T_k_next[:3, 3])), typical, _SIGMA_FLOOR)
+    sigmas = np.repeat([np.deg2rad(_ROTATION_SIGMA_DEG), _TRANSLATION_RELATIVE_SIGMA * length], 3)
+    return RelativePose(k, k + 1, T_k_next, sigmas, INTERPOLATED_SOURCE)
+
+
+def _without_frozen(
+    by_network: Mapping[int, FloatArray],
+    steps: Steps,
+    map_poses: KeyframePoses,
+    repeated: Collection[int],
+    new: Collection[int],
+) -> tuple[set[int], Steps]:
+    """Repeated frames during which the camera moved, and the steps that remain without them.
+
+    The length of the step to the next new image decides: short if the camera stood; the length of
+    as many steps as images were repeated if it moved. A length between the two is a failed match
+    over a wide baseline and is not used. Without a new image soon after the camera is assumed to
+    stand.
+    """
+    frozen: set[int] = set()
+    for first, last in runs(repeated):
+        before = [
+            T for k, T in by_network.items() if first - 1 - _STEPS_OF_A_MOTION <= k < first - 1
+        ]
+        following = next((k for k in range(last + 1, last + 2 + _LONGEST_DOUBT) if k in new), None)
+        if not before or following is None:
+            continue
+        expected = float(np.median([np.linalg.norm(T[:3, 3]) for T in before]))
+        jump = steps.get((last, following))
+        repeats, onward = last - first + 1, following - last
+        halfway = (onward + repeats / 2) * expected
+        length = map_poses.length(last, following) if jump is None else jump.length_unscaled
+        if length is not None and length <= min(halfway, onward * _LONGEST_START * expected):
+            continue
+        still = set(range(first, last + 1))
+        frozen |= still
+        steps = {ends: motion for ends, motion in steps.items() if still.isdisjoint(ends)}
+        if jump is not None and jump.length_unscaled > halfway:
+            over_gap = Motion(replace(jump.relative_pose, from_index=first - 1))
+            steps = {**steps, over_gap.ends: over_gap}
+    return frozen, steps
+
+
+def _poses(steps: Steps) -> list[RelativePose]:
+    return [motion.relative_pose for motion in steps.values()]
+
+
+def _completed(known: Mapping[int, FloatArray], steps: Collection[int]) -> dict[int, FloatArray]:
+    """Motions of all steps: unknown ones are interpolated from the mean motion before them to that after them."""
+    unknown = [step for step in steps if step not in known]
+    if not unknown:
+        return dict(known)
+    numbers = np.array(sorted(known))
+    motion = tangent(np.array([known[k] for k in numbers.tolist()]))
+    found = np.empty((len(unknown), 6))
+    for row, step in enumerate(unknown):
+        after = int(np.searchsorted(numbers, step))
+        before = slice(max(after - _STEPS_OF_A_MOTION, 0), after)
+        means, distances = [], []
+        for part in (before, slice(after, after + _STEPS_OF_A_MOTION)):
+            if len(numbers[part]):
+                means.append(motion[part].mean(axis=0))
+                distances.append(np.abs(numbers[part] - step).min())
+        weights = np.array(distances, np.float64)[::-1]  # of two, the nearer mean weighs more
+        found[row] = weights @ np.array(means) / weights.sum()
+    T = from_rotation_vector(found[:, :3], found[:, 3:])
+    return {**known, **dict(zip(unknown, T, strict=True))}
+
+
+def _filled(
+    snippets: Sequence[SnippetPoses], steps: Mapping[int, FloatArray], count: int, sources: int
+) -> list[SnippetPoses]:
+    """One snippet a target; missing ones are chained from single steps."""
+    by_target = {snippet.target: snippet for snippet in snippets}
+    T_first_camera = chain(np.array([steps[k] for k in range(count - 1)]))
+    filled, half = [], sources // 2
+    for target in range(half, count - sources + half):
+        snippet = by_target.get(target)
+        if snippet is None:
+            around = [k for k in range(target - half, target - half + sources + 1) if k != target]
+            T_source_target = invert(T_first_camera[around]) @ T_first_camera[target]
+            snippet = SnippetPoses(target, tuple(around), T_source_target)
+        filled.append(snippet)
+    return filled

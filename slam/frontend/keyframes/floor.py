@@ -1,0 +1,98 @@
+"""The floor under a carried camera, and the units of maps by it.
+
+The height of a carried camera above the floor is what all maps of a drive have in common.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from slam.frontend.keyframes.local_map import LocalMap
+
+_SAMPLES = 1000
+_ROUNDS = 3
+_MOST_POINTS = 2000  # by which planes are compared
+_LEAST_COSINE = 0.8  # between the plane's normal and down by the cameras, which are held upright
+_THICKNESS = 0.04  # of the floor, over the camera's height
+# points on the floor, over all, and in number
+_LEAST_RATIO = 0.04
+_LEAST_POINTS = 25
+_MOST_BELOW = 0.5  # points below the floor over those on it: a table has the floor below it
+_MOST_SPREAD = 0.15  # of the camera's height
+_MOST_CONTRADICTION = np.log(1.4)  # between two units of a map: a table is half as high
+
+
+def units_by_floor(
+    maps: Sequence[LocalMap], learned_units: Sequence[float], seed: int = 0
+) -> list[float]:
+    """The units of maps, so that the camera has one height in all that see a floor.
+
+    They are the learned ones where the floor contradicts these.
+
+    Args:
+        maps: all of one drive.
+        learned_units: of learned depth per unit of each map.
+        seed: of the planes that are drawn.
+    """
+    units = list(learned_units)
+    floors: dict[int, float] = {}
+    for row, local in enumerate(maps if len(maps) > 1 else ()):
+        height = height_above_floor(local, seed)
+        if height is not None:
+            floors[row] = height
+    if floors:
+        logarithms = [np.log(height * units[row]) for row, height in floors.items()]
+        common = float(np.exp(np.median(logarithms)))
+        for row, height in floors.items():
+            if abs(np.log(common / height / units[row])) < _MOST_CONTRADICTION:
+                units[row] = common / height
+    return units
+
+
+def height_above_floor(local: LocalMap, seed: int = 0) -> float | None:
+    """The median height of the keyframes above the plane below which nothing is; None where no such plane is seen."""
+    T_map_camera = local.T_world_camera
+    centres = T_map_camera[:, :3, 3]
+    down = T_map_camera[:, :3, 1].mean(axis=0)
+    seen = np.unique(np.concatenate([keyframe.track_ids for keyframe in local.keyframes]))
+    points = local.points[seen[local.parallax(local.keyframes).settled[seen]]]
+    if len(points) < _LEAST_POINTS:
+        return None
+    origin = np.median(centres, axis=0)
+    points, centres = points - origin, centres - origin
+    rng = np.random.default_rng(seed)
+    points = rng.permutation(points)[:_MOST_POINTS]
+    depth = points @ down
+    low = points[depth >= np.median(depth[depth > 0])] if (depth > 0).any() else points
+    corners = low[rng.integers(len(low), size=(_SAMPLES, 3))]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    normals, first = normals[length > 0] / length[length > 0, None], corners[length > 0, 0]
+    normals *= np.sign(normals @ down)[:, None]
+    heights = np.sum(normals * first, axis=1)
+    possible = (normals @ down > _LEAST_COSINE * np.linalg.norm(down)) & (heights > 0)
+    if not possible.any():
+        return None
+    normals, heights = normals[possible], heights[possible]
+    over = points @ normals.T / heights - 1.0
+    on, below = (np.abs(over) < _THICKNESS).sum(axis=0), (over > _THICKNESS).sum(axis=0)
+    best = int(np.argmax(on - below / _MOST_BELOW))
+    normal, height = normals[best], float(heights[best])
+    for _ in range(_ROUNDS):
+        floor = points[np.abs(points @ normal / height - 1.0) < _THICKNESS]
+        if len(floor) < max(_LEAST_POINTS, _LEAST_RATIO * len(points)):
+            return None
+        middle = floor.mean(axis=0)
+        normal = np.linalg.svd(floor - middle, full_matrices=False)[2][2]
+        normal *= np.sign(normal @ down)
+        height = float(normal @ middle)
+    below = (points @ normal > (1.0 + _THICKNESS) * height).sum()
+    heights_above = height - centres @ normal
+    usual = float(np.median(heights_above))
+    is_level = (
+        normal @ down > _LEAST_COSINE * np.linalg.norm(down)
+        and np.std(heights_above) < _MOST_SPREAD * usual
+    )
+    return usual if is_level and below < _MOST_BELOW * len(floor) else None

@@ -1,0 +1,182 @@
+"""Gaps are interpolated with the motion around them, and with wide sigmas."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pytest
+from oracle import snippets_of
+
+from slam.frames import RelativePose, SnippetPoses
+from slam.frontend.drive import Drive
+from slam.frontend.factors import chain_raw
+from slam.frontend.gaps import INTERPOLATED_SOURCE, interpolate_gaps
+from slam.frontend.visual.motion import Motion
+from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert
+from slam.runtime.errors import Failed, SlamError
+
+COUNT = 40
+STEP = from_rotation_vector(np.array([0.0, 0.02, 0.0]), np.array([0.0, 0.0, 1.0]))
+
+
+def steady(count: int = COUNT) -> FloatArray:
+    return chain(np.tile(STEP, (count - 1, 1, 1)))
+
+
+def measured(T_world_camera: FloatArray, first: int, last: int) -> Motion:
+    T_from_to = invert(T_world_camera[first]) @ T_world_camera[last]
+    return Motion(RelativePose(first, last, T_from_to, np.full(6, 0.01), "essential"))
+
+
+def closed(T_world_camera: FloatArray, unusable: set[int], *steps: Motion) -> Drive:
+    reasons = dict.fromkeys(unusable, "black")
+    return interpolate_gaps(
+        collected(snippets_of(T_world_camera, unusable=unusable), steps, unusable=reasons), 4
+    )
+
+
+def collected(snippets: list[SnippetPoses], steps: Iterable[Motion] = (), **others: Any) -> Drive:
+    roads = [Failed("not drawn")] * COUNT
+    return Drive(snippets=snippets, motions=list(steps), roads=roads, **others)
+
+
+def test_a_drive_without_gaps_stays_as_it_was() -> None:
+    snippets, steps = snippets_of(steady()), [measured(steady(), 3, 4)]
+    found = interpolate_gaps(collected(snippets, steps), 4)
+    assert found.snippets == found.trusted == snippets and found.motions == steps
+    assert found.gap_steps == [] and found.interpolated == {}
+
+
+@pytest.mark.parametrize(
+    "gap", [{20}, set(range(15, 25)), {0}, {39}, {3, 20, 21}, {10, 12, 14, 16}]
+)
+def test_a_gap_of_a_steady_drive_is_interpolated_exactly(gap: set[int]) -> None:
+    found = closed(steady(), gap)
+    assert set(found.interpolated) == gap and found.interpolated[min(gap)] == "black"
+    np.testing.assert_allclose(chain_raw(found.snippets, COUNT), steady(), atol=1e-9)
+    assert not any(gap & {s.target, *s.sources} for s in found.trusted)
+    for factor in found.gap_steps:
+        np.testing.assert_allclose(factor.T_from_to, STEP, atol=1e-9)
+        assert factor.source == INTERPOLATED_SOURCE and factor.to_index == factor.from_index + 1
+        np.testing.assert_allclose(factor.sigmas, np.repeat([np.deg2rad(2.0), 0.5], 3), rtol=1e-6)
+    linked = {f.from_index for f in found.gap_steps}
+    linked |= {step for s in found.trusted for step in range(min(s.sources), max(s.sources))}
+    assert linked == set(range(COUNT - 1))
+
+
+def test_a_gap_beside_steps_of_the_network_alone_has_the_unit_of_learned_depth() -> None:
+    """The network's lengths are three quarters of those by learned depth."""
+    short = steady()
+    short[:, :3, 3] *= 0.75
+    steps = [measured(steady(), k, k + 1) for k in (*range(14), *range(26, COUNT - 1))]
+    unusable = set(range(17, 23))
+    found = interpolate_gaps(
+        collected(
+            snippets_of(short, unusable=unusable), steps, unusable=dict.fromkeys(unusable, "black")
+        ),
+        4,
+    )
+    for factor in found.gap_steps:
+        np.testing.assert_allclose(factor.T_from_to, STEP, atol=1e-9)
+    np.testing.assert_allclose(chain_raw(found.snippets, COUNT), short, atol=1e-9)
+
+
+def test_the_motion_changes_evenly_from_before_to_after() -> None:
+    lengths = np.r_[np.full(19, 1.0), np.full(20, 3.0)]
+    drive = chain(
+        from_rotation_vector(
+            np.zeros((39, 3)), np.stack([0 * lengths, 0 * lengths, lengths], axis=1)
+        )
+    )
+    steps = {f.from_index: f.T_from_to[2, 3] for f in closed(drive, set(range(15, 25))).gap_steps}
+    values = [steps[k] for k in range(14, 25)]
+    assert values == sorted(values) and 1.0 < values[0] < 1.5 and 2.5 < values[-1] < 3.0
+
+
+def test_a_step_over_a_gap_is_divided_into_equal_ones() -> None:
+    drive = steady()
+    drive[25:] = (
+        drive[14]
+        @ from_rotation_vector(np.array([0.0, 0.4, 0.0]), np.array([1.0, 0.0, 5.0]))
+        @ drive[:15]
+    )
+    over_gap = measured(drive, 14, 25)
+    found = closed(drive, set(range(15, 25)), over_gap)
+    inside = [f.T_from_to for f in found.gap_steps if 14 <= f.from_index < 25]
+    np.testing.assert_allclose(
+        chain(np.array(inside))[-1], over_gap.relative_pose.T_from_to, atol=1e-9
+    )
+    assert found.steps[14, 25] is over_gap
+
+
+def test_steps_measured_by_image_geometry_are_not_interpolated() -> None:
+    found = closed(steady(), {10, 12}, measured(steady(), 5, 6), measured(steady(), 8, 9))
+    assert [f.from_index for f in found.gap_steps] == [9, 10, 11, 12]
+    assert [f.from_index for f in closed(steady(), {2}).gap_steps] == [0, 1, 2]
+
+
+def test_a_step_that_skips_usable_frames_does_not_change_the_interpolation() -> None:
+    """A step from a keyframe beside those from frame to frame; its frames are measured by the network."""
+    without, beside = closed(steady(), {20}), closed(steady(), {20}, measured(drifting(), 5, 11))
+    assert [f.ends for f in beside.gap_steps] == [f.ends for f in without.gap_steps]
+    for one, other in zip(without.gap_steps, beside.gap_steps, strict=True):
+        np.testing.assert_array_equal(one.T_from_to, other.T_from_to)
+    assert list(beside.steps) == [(5, 11)]
+
+
+def drifting() -> FloatArray:
+    return chain(
+        np.tile(
+            from_rotation_vector(np.array([0.0, 0.1, 0.0]), np.array([0.0, 0.0, 2.0])),
+            (COUNT - 1, 1, 1),
+        )
+    )
+
+
+def repeating(frozen: bool) -> tuple[Drive, FloatArray]:
+    """Ten repeated images: the camera moved, or stood."""
+    T_steps = np.tile(STEP, (COUNT - 1, 1, 1))
+    if not frozen:
+        T_steps[14:24] = np.eye(4)
+    true = chain(T_steps)
+    seen = true.copy()
+    seen[15:25] = seen[14]
+    steps = [measured(seen, k, k + 1) for k in range(COUNT - 1)]
+    return interpolate_gaps(
+        collected(snippets_of(seen), steps, repeated=list(range(15, 25))), 4
+    ), true
+
+
+def test_repeated_images_of_a_moving_camera_are_interpolated() -> None:
+    found, true = repeating(frozen=True)
+    assert (
+        set(found.interpolated) == set(range(15, 25)) and "stands still" in found.interpolated[15]
+    )
+    assert [f.from_index for f in found.gap_steps] == list(range(14, 25))
+    np.testing.assert_allclose(
+        chain(np.array([f.T_from_to for f in found.gap_steps])), true[:12], atol=1e-9
+    )
+    assert [ends for ends in found.steps if ends[1] - ends[0] > 1] == [(14, 25)]
+    assert not any(set(range(15, 25)).intersection(ends) for ends in found.steps)
+
+
+def test_repeated_images_of_a_standing_camera_are_measurements() -> None:
+    found, _ = repeating(frozen=False)
+    assert found.interpolated == {} and found.gap_steps == [] and len(found.trusted) == COUNT - 4
+    assert len(found.steps) == COUNT - 1
+
+
+def test_repetition_to_the_end_is_standing_still() -> None:
+    still = np.tile(np.eye(4), (COUNT, 1, 1))
+    found = interpolate_gaps(collected(snippets_of(still), repeated=list(range(1, COUNT))), 4)
+    assert found.interpolated == {} and found.gap_steps == []
+
+
+def test_without_any_snippet_there_is_one_error() -> None:
+    reasons = dict.fromkeys(range(3, COUNT, 4), "image 3 is truncated")
+    with pytest.raises(
+        SlamError, match="no 5 usable frames in a row among 40: image 3 is truncated"
+    ):
+        interpolate_gaps(collected([], unusable=reasons), 4)

@@ -32,7 +32,7 @@ from slam.frontend.visual.motion import Motion, path_between, shortest_by_start
 from slam.frontend.visual.odometry import VisualOdometry
 from slam.geometry.se3 import chain, is_se3
 from slam.loops.recognition import FeatureExtractor
-from slam.pipeline.keyframe_maps import KeyframeTracking
+from slam.pipeline.front_end_choice import KeyframeTracking
 from slam.runtime.errors import Failed, MissingFrameError, SequenceError, SlamError
 from slam.runtime.resources import SpillFile, Stopwatch, return_freed_memory
 

@@ -43,7 +43,7 @@ from slam.mapping.depth import KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.pipeline.checks import require_possible, warn_of_doubts, warn_of_images
 from slam.pipeline.estimate import Estimate, Odometry, fuse
-from slam.pipeline.keyframe_maps import close_maps
+from slam.pipeline.map_closure import close_maps
 from slam.pipeline.observer import Observer
 from slam.runtime.errors import Failed, SequenceError, SlamError, attempt
 from slam.runtime.imports import import_open3d_beside

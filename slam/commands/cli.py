@@ -479,7 +479,9 @@ def doctor(
 
 def _print_run(folder: RunFolder) -> None:
     """The errors of a run, what raises doubt, and where everything is."""
-    from slam.results.tables import by_reason, errors_table, verdict, written
+    from slam.results.report.tables import by_reason
+    from slam.results.tables import errors_table, written
+    from slam.results.verdict import verdict
     from slam.runtime.files import REPORT
 
     metrics = folder.metrics()

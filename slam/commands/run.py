@@ -32,17 +32,12 @@ from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline
 from slam.prediction.assembly import Prediction, open_prediction
 from slam.prediction.depth_source import FrameNumbers
-from slam.results.estimate_metrics import (
-    DepthQuality,
-    estimate_metrics,
-    lidar_trajectory,
-    map_errors,
-    timing_of,
-)
+from slam.results.estimate_metrics import estimate_metrics, lidar_trajectory, timing_of
 from slam.results.folder import RunFolder, RunLog, check_output, run_log
 from slam.results.metrics import MapMetrics, Metrics, Provenance
 from slam.results.report.page import DepthPictures, Picture, loop_pictures, write_report
 from slam.results.report.rerun import write_rerun
+from slam.results.truth_errors import DepthQuality, map_errors
 from slam.runtime.errors import EmptyMapError, Failed, RunError, SlamError, attempt
 from slam.runtime.files import (
     CONFIG,

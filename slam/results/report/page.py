@@ -23,10 +23,11 @@ from slam.formats.trajectory import Trajectory
 from slam.frames import Image, Intrinsics
 from slam.loops.recognition import Loop
 from slam.mapping.depth import KeyframeDepth
-from slam.results import tables
 from slam.results.folder import RunFolder
 from slam.results.metrics import METRES, AcceptedLoop, LoopsFile, Metrics
-from slam.results.tables import alignments_table, errors_table, missing_errors, verdict
+from slam.results.report import tables
+from slam.results.tables import alignments_table, errors_table, missing_errors
+from slam.results.verdict import verdict
 from slam.runtime.errors import SlamError
 from slam.runtime.files import LOOPS, REFERENCE, REPORT, TRAJECTORIES
 from slam.runtime.record import NOT_RECORDED

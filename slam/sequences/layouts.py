@@ -23,14 +23,8 @@ from erfsfm.common.readers.camera_file import CameraFile, camera_of
 from erfsfm.common.readers.images import first_size, has_images, list_images, read_depth_map
 from erfsfm.common.readers.kitti import read_velodyne
 from erfsfm.common.readers.numbering import NumberedFiles, by_name, by_table
-from slam.formats.trajectory import (
-    BadRows,
-    in_seconds,
-    nearest_stamps,
-    number_or_nan,
-    read_trajectory,
-    rows_of,
-)
+from slam.formats.rows import BadRows, in_seconds, number_or_nan, rows_of
+from slam.formats.trajectory import nearest_stamps, read_trajectory
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError

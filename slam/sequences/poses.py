@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from erfsfm.common.files import read_text
-from slam.formats.trajectory import BadRows, in_seconds, other_unit, read_trajectory, text_of
+from slam.formats.rows import BadRows, in_seconds, text_of
+from slam.formats.trajectory import other_unit, read_trajectory
 from slam.frames import GpsTrack, runs
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray

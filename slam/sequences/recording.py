@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.numbering import NumberedFiles
-from slam.formats.trajectory import BadRows, in_seconds, number_or_nan, rows_of
+from slam.formats.rows import BadRows, in_seconds, number_or_nan, rows_of
 from slam.frames import Frame, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, is_se3
 from slam.runtime.errors import SequenceError, SlamError, sequence_errors

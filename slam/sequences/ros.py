@@ -14,7 +14,8 @@ import numpy as np
 
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.images import first_usual, stretch_of
-from slam.formats.trajectory import BadRows, nearest_pairs
+from slam.formats.rows import BadRows
+from slam.formats.trajectory import nearest_pairs
 from slam.frames import Image
 from slam.geometry.se3 import FloatArray, invert
 from slam.runtime.errors import SequenceError

@@ -52,7 +52,7 @@ from slam.runtime.files import (
 )
 from slam.runtime.imports import import_extra
 from slam.sequences.catalogue import open_sequence
-from slam.sequences.poses import read_gps
+from slam.sequences.gps_track import read_gps
 
 logger = logging.getLogger(__name__)
 

@@ -34,7 +34,9 @@ from slam.geometry.se3 import chain, is_se3
 from slam.loops.recognition import FeatureExtractor
 from slam.pipeline.front_end_choice import KeyframeTracking
 from slam.runtime.errors import Failed, MissingFrameError, SequenceError, SlamError
-from slam.runtime.resources import SpillFile, Stopwatch, return_freed_memory
+from slam.runtime.memory import return_freed_memory
+from slam.runtime.spill_file import SpillFile
+from slam.runtime.stopwatch import Stopwatch
 
 logger = logging.getLogger(__name__)
 

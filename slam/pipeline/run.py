@@ -47,7 +47,7 @@ from slam.pipeline.map_closure import close_maps
 from slam.pipeline.observer import Observer
 from slam.runtime.errors import Failed, SequenceError, SlamError, attempt
 from slam.runtime.imports import import_open3d_beside
-from slam.runtime.resources import Stopwatch
+from slam.runtime.stopwatch import Stopwatch
 from slam.sequences.recording import RecordedSequence
 
 logger = logging.getLogger(__name__)

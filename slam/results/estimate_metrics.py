@@ -29,7 +29,8 @@ from slam.pipeline.estimate import Estimate
 from slam.results import metrics as records
 from slam.results.metrics import Metrics
 from slam.runtime.errors import Failed
-from slam.runtime.resources import Stopwatch, peak_rss_mb
+from slam.runtime.memory import peak_rss_mb
+from slam.runtime.stopwatch import Stopwatch
 
 LEVELS = (50, 90, 95)  # per cent of the factors that the bounds of their stated noise hold
 _NO_TRUTH = Failed("the sequence has no true poses")

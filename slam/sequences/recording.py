@@ -24,8 +24,9 @@ from slam.frames import Frame, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, is_se3
 from slam.runtime.errors import SequenceError, SlamError, sequence_errors
 from slam.sequences.camera_file import Undistortion, require_size, undistorted
+from slam.sequences.gps_track import FASTEST_M_S
 from slam.sequences.images import ImageFiles, ImageSource, ReadImages, too_long
-from slam.sequences.poses import FASTEST_M_S, known_poses, rebased
+from slam.sequences.poses import known_poses, rebased
 
 logger = logging.getLogger(__name__)
 

@@ -19,7 +19,7 @@ from slam.geometry.se3 import FloatArray, chain, from_rotation_vector
 from slam.pipeline.front_end_choice import FrontEnd, KeyframeTracking, choose
 from slam.pipeline.observer import Observer
 from slam.runtime.errors import Failed
-from slam.runtime.resources import Stopwatch
+from slam.runtime.stopwatch import Stopwatch
 
 KEYFRAMES_ALONE = SlamConfig(
     keyframes=KeyframesConfig(use="always"),

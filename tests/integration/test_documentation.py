@@ -88,7 +88,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"^erfsfm-slam download ", "it downloads; tests/slam/commands/downloads has a server"),
     (
         r"^erfsfm-slam calibrate ",
-        "it wants images of a board; tests/slam/commands/calibration renders them",
+        "it wants images of a board; tests/slam/commands/test_calibration.py renders them",
     ),
     (
         r"--truth many-views",

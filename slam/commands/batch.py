@@ -367,9 +367,8 @@ def _end_with_the_worker() -> None:
     os.kill(os.getpid(), signal.SIGTERM)
 
 
-if (
-    __name__ == "__main__"
-):  # LOCK run ...: a drive, which ends when its standard input does; no two to one folder
+# LOCK run ...: a drive, which ends when its standard input does; no two to one folder
+if __name__ == "__main__":
     lock = Path(sys.argv.pop(1)).open("w", encoding="utf-8")  # noqa: SIM115 - held until the process ends
     fcntl.flock(lock, fcntl.LOCK_EX)
     threading.Thread(target=_end_with_the_worker, daemon=True).start()

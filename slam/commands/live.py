@@ -135,9 +135,8 @@ class LiveRecorder(FolderRecorder):
                 "scale": newest.unit,
                 "support": support,
             }
-            message |= {
-                "T_world_camera": newest.T_world_camera[:3].ravel().tolist()
-            }  # row by row as in KITTI's files
+            # row by row as in KITTI's files
+            message |= {"T_world_camera": newest.T_world_camera[:3].ravel().tolist()}
             late_ms = None if at_s is None else round(1e3 * (time.monotonic() - at_s), 1)
             self._emit(message | {"latency_ms": late_ms, "dropped": sequence.dropped})
             if self._viewer is not None:

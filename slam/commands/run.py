@@ -302,9 +302,8 @@ def perform(request: RunRequest) -> RunFolder:
             request.dataset, request.sequence, request.camera, request.frames, request.truth
         )
         lens, camera = recording.undistortion, recording.intrinsics
-        numbers = FrameNumbers(
-            len(recording), recording.start, recording.recorded
-        )  # by which files of depth are found
+        # by which files of depth are found
+        numbers = FrameNumbers(len(recording), recording.start, recording.recorded)
         undistort = None if lens is None else lens.apply_to_depth
         prediction = open_prediction(
             request.weights, request.device, settings.depth, camera, numbers, undistort
@@ -352,9 +351,8 @@ def record(
 def provenance_of(request: Request, prediction: Prediction, recording: FrameSequence) -> Provenance:
     """The input of a run: networks, depth, and the options that name the recording."""
     networks, source = prediction.networks, prediction.source
-    is_folder = Path(request.weights) == Path(
-        networks.origin
-    )  # else a shipped name, whatever lies here
+    # else a shipped name, whatever lies here
+    is_folder = Path(request.weights) == Path(networks.origin)
     return Provenance(
         version=__version__,
         commit=commit(),

@@ -143,9 +143,8 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
     is_near = (np.abs(T_world_camera[:, :3, 3]) <= _FARTHEST).all(axis=1)
     checks.append((is_near, f"a position is farther than {_FARTHEST:g}"))
     R = T_world_camera[:, :3, :3]
-    with np.errstate(
-        over="ignore", invalid="ignore"
-    ):  # an overflow becomes NaN, which fails the check
+    # an overflow becomes NaN, which fails the check
+    with np.errstate(over="ignore", invalid="ignore"):
         deviation = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
         is_rotation = (deviation < _ROTATION_TOLERANCE) & (np.linalg.det(R) > 0)
     checks.append((is_rotation, "the 3x3 part is not a rotation matrix"))

@@ -219,9 +219,8 @@ def _joined(
     place = np.full(len(rows.keyframes), -1)
     place[chosen] = np.arange(len(chosen))
     edges, shared = [], []
-    for first, row in enumerate(
-        chosen
-    ):  # between neighbouring keyframes of one map, whose unit hardly changes
+    # between neighbouring keyframes of one map, whose unit hardly changes
+    for first, row in enumerate(chosen):
         for last in range(first + 1, min(first + 1 + _NEIGHBOURS, len(chosen))):
             if rows.maps[row] == rows.maps[chosen[last]]:
                 T_step = invert(rows.T_map_camera[row]) @ rows.T_map_camera[chosen[last]]

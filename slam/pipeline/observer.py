@@ -44,9 +44,8 @@ _NO_POSE = "its pose is no finite rigid transform and leaves a gap"
 _MOVED_ON_HEIGHTS = 1.5  # way of the camera after which depth is predicted again, camera heights
 _LAST_ROADS = 8  # looked back for the camera's height, frames
 _MOST_UNREAD = 30  # unreadable images in a row: three seconds at 10 Hz, beyond which the motion cannot be guessed
-_LOOP_STRIDE = (
-    4  # frames between views for loops: a car goes some 4 m, still the same place to a descriptor
-)
+# frames between views for loops: a car goes some 4 m, still the same place to a descriptor
+_LOOP_STRIDE = 4
 
 
 @dataclass
@@ -137,9 +136,8 @@ class Observer:
         if index % 200 == 0:  # 24 MB
             return_freed_memory()
         if isinstance(frame, SequenceError):
-            is_missing = (
-                isinstance(frame, MissingFrameError) and self._config.gaps.enabled
-            )  # never ends a run
+            # never ends a run
+            is_missing = isinstance(frame, MissingFrameError) and self._config.gaps.enabled
             self._unread += not is_missing
             if not (is_missing or self._is_gap(self._unread)):
                 raise frame
@@ -411,9 +409,8 @@ class Observer:
     def _finish_tasks(self, stage: str | None = None) -> None:
         """Wait for the tasks of the last frame, or for those of one stage alone."""
         tasks = [task for task in self._tasks if stage in (None, task.stage)]
-        self._tasks = [
-            task for task in self._tasks if task not in tasks
-        ]  # so that a failed one is not raised again
+        # so that a failed one is not raised again
+        self._tasks = [task for task in self._tasks if task not in tasks]
         for task in tasks:
             with self._stopwatch.stage(task.stage):
                 result = task.result.result()

@@ -353,9 +353,8 @@ class SlamPipeline:
         """Agreements of all sources and of the images, and what follows from them."""
         drive, scale, by_sources = odometry.drive, odometry.scale, list(odometry.agreements)
         if self._fixes is not None and (by_gps := self._fixes.agreement) is not None:
-            by_sources.append(
-                by_gps if by_gps.is_wrong else by_gps.said()
-            )  # why it is not used was said
+            # why it is not used was said
+            by_sources.append(by_gps if by_gps.is_wrong else by_gps.said())
         needs_road = scale.unit in ("metres", "camera heights")
         of_images = agreement.of_images(
             drive, self.sequence.intrinsics, scale.contradicted, needs_road

@@ -94,9 +94,8 @@ def lidar_truth(
             points = np.empty((0, 3))
         ranges = np.linalg.norm(points, axis=1)
         sines = points[ranges > 1.0, 2] / ranges[ranges > 1.0]
-        beams = (
-            np.quantile(sines, [0.001, 0.999]) if len(sines) else (1.0, -1.0)
-        )  # stray points left out
+        # stray points left out
+        beams = np.quantile(sines, [0.001, 0.999]) if len(sines) else (1.0, -1.0)
         limits[frame] = float(beams[0]), float(beams[1])
         points = apply(T_camera_lidar, points[ranges <= RANGE_M])
         return Surface(apply(reference[frame], points), _in_image(points, sequence.intrinsics))

@@ -17,6 +17,7 @@ from slam.runtime.errors import SlamError
 from slam.sequences.images import ImageSource
 
 Pattern = Literal["chessboard", "charuco"]
+
 _BOARD = re.compile(r"(\d+)x(\d+)")
 _FEWEST = 3  # corners along one side
 _LEAST_CHARUCO = 12  # corners of a view: more than a homography needs

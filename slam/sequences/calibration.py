@@ -14,6 +14,7 @@ from slam.runtime.errors import SlamError
 from slam.sequences.board import FEWEST_VIEWS, View
 
 Model = Literal["opencv", "fisheye"]
+
 _FLAGS_HOME = cv2 if hasattr(cv2, "CALIB_RECOMPUTE_EXTRINSIC") else cv2.fisheye  # before OpenCV 5
 _FISHEYE_FLAGS = _FLAGS_HOME.CALIB_RECOMPUTE_EXTRINSIC | _FLAGS_HOME.CALIB_FIX_SKEW
 _OUTLIER = 3.0  # times the median error of a view

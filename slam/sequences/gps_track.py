@@ -57,9 +57,8 @@ def read_gps(path: Path) -> GpsTrack:
     steps = np.diff(angles, axis=0)
     steps[:, 1] *= np.cos(angles[1:, 0])
     speeds = _EARTH_RADIUS_M * np.linalg.norm(steps, axis=1) / np.diff(table[:, 0])
-    if (
-        len(table) >= _LEAST_FIXES and np.median(speeds) > FASTEST_M_S
-    ):  # another column, unit or clock
+    # another column, unit or clock
+    if len(table) >= _LEAST_FIXES and np.median(speeds) > FASTEST_M_S:
         speed = f"{np.median(speeds):.0f} m/s"
         raise SequenceError(
             f"{path}: its fixes move at {speed}: check its columns, and that stamps are seconds"

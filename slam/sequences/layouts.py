@@ -63,6 +63,13 @@ _SEVEN_SCENES_IMAGE = re.compile(r"frame-(\d{6})\.color\.png")
 _NUSCENES_FPS = 12.0
 
 Row = dict[str, Any]
+# the benchmark's table of its three cameras: fx, fy, cx, cy and the distortion; images of freiburg3 are undistorted
+_FREIBURG_CAMERAS = {
+    "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": ((535.4, 539.2, 320.1, 247.6), ()),
+}
+_SCANNET_CAMERA = "intrinsic/intrinsic_color.txt"
 
 
 def _recorded(
@@ -198,14 +205,6 @@ def _T_body_sensor(path: Path) -> FloatArray:
 # TUM RGB-D: rgb.txt and, where known, groundtruth.txt and depth.txt
 
 
-# the benchmark's table of its three cameras: fx, fy, cx, cy and the distortion; images of freiburg3 are undistorted
-_FREIBURG_CAMERAS = {
-    "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
-    "2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
-    "3": ((535.4, 539.2, 320.1, 247.6), ()),
-}
-
-
 def _freiburg_camera(number: str) -> CameraFile:
     pinhole, distortion = _FREIBURG_CAMERAS[number]
     lens = {"model": "opencv", "distortion": distortion} if distortion else {}
@@ -330,9 +329,6 @@ def _open_scannet(folder: Path, asked: Path | None) -> RecordedSequence:
     return _recorded(
         "scannet", folder.name, files, stamps, asked, [folder], own, numbers[0], **known
     )
-
-
-_SCANNET_CAMERA = "intrinsic/intrinsic_color.txt"
 
 
 def _scannet_camera(path: Path, files: NumberedFiles) -> CameraFile:

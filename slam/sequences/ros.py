@@ -46,6 +46,9 @@ _SKIPPED_FRAMES = 30
 _SCAN_DELAY_S = 0.05
 _NANOSECONDS = 10**9
 
+Mounts = dict[str, tuple[str, FloatArray]]
+"""Parent and ``T_parent_child`` ``(4, 4)`` of each frame of ``/tf_static``; the last that is said counts."""
+
 
 class StampedMessages:
     """The messages of a topic whose first field is a header, in the order of their stamps, read one at a time.
@@ -135,8 +138,6 @@ def images_of(messages: StampedMessages, where: str) -> ReadImages:
     return ReadImages(width, height, len(rows), read)
 
 
-Mounts = dict[str, tuple[str, FloatArray]]
-"""Parent and ``T_parent_child`` ``(4, 4)`` of each frame of ``/tf_static``; the last that is said counts."""
 
 
 def transform_between(mounts: Mounts, a: str, b: str) -> FloatArray | None:

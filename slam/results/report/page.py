@@ -125,9 +125,8 @@ def _plots(
         section: str, title: str, caption: str, draw: Callable[..., Figure], *given: Any
     ) -> None:
         try:
-            figure = draw(*given).update_layout(
-                template={}
-            )  # page.js draws it in the colours of the page
+            # page.js draws it in the colours of the page
+            figure = draw(*given).update_layout(template={})
             plot = str(figure.to_json()).replace("<", "\\u003c")
             found[section].append(Picture(title, caption, plot=plot))
         except SlamError as error:

@@ -57,16 +57,15 @@ _NO_MAP = Failed("no map point lies within 25 m of a camera whose surroundings a
 _NO_SURFACE = Failed("no true surface is known at this distance from a camera")
 _FEW = Failed("too few points at this distance from a camera")
 ERRORS = (
-    *(
-        "accuracy_median_m",
-        "accuracy_90_m",
-        "outlier_share",
-        "completeness",
-        "f_score",
-        "precision",
-        "recall",
-    ),
-    *("in_field", "by_distance"),
+    "accuracy_median_m",
+    "accuracy_90_m",
+    "outlier_share",
+    "completeness",
+    "f_score",
+    "precision",
+    "recall",
+    "in_field",
+    "by_distance",
 )
 
 

@@ -138,8 +138,6 @@ def images_of(messages: StampedMessages, where: str) -> ReadImages:
     return ReadImages(width, height, len(rows), read)
 
 
-
-
 def transform_between(mounts: Mounts, a: str, b: str) -> FloatArray | None:
     """``T_a_b`` ``(4, 4)`` of two frames; None where no static transforms join them, or where one has no name."""
     names = [frame.removeprefix("/") for frame in (a, b)]  # ROS 1 may write a slash

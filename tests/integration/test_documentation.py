@@ -116,7 +116,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"^erfsfm-slam batch ", "it starts a cluster; tests/slam/commands/batch does"),
     (
         r"--dataset walk ",
-        "it wants a walk of 311 frames; tests/slam/pipeline/test_positioning.py has known distances",
+        "it wants a walk of 311 frames; tests/slam/pipeline/test_run.py has known distances",
     ),
     (
         r"clear640|other640|kitti05",

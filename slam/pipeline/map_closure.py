@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,9 +95,9 @@ class _Rows:
 
     def __init__(self, maps: Sequence[LocalMap], poses: KeyframePoses) -> None:
         self.segments = maps
-        self.keyframes: list[TrackedKeyframe] = [
-            keyframe for segment in maps for keyframe in segment.keyframes
-        ]
+        self.keyframes: list[TrackedKeyframe] = []
+        for segment in maps:
+            self.keyframes += segment.keyframes
         counts = [len(segment.keyframes) for segment in maps]
         self.maps: NDArray[np.intp] = np.repeat(np.arange(len(maps)), counts)
         self.T_map_camera = np.concatenate([segment.T_world_camera for segment in maps])
@@ -121,6 +122,10 @@ class _Rows:
         earlier, later = self.track.rows([loop])[0].tolist()
         return earlier, later
 
+    def _maps_of(self, loop: Loop) -> set[int]:
+        """Numbers of the maps of its keyframes, of which there may be one."""
+        return set(self.maps[list(self.of(loop))].tolist())
+
     def views(self) -> list[View]:
         """Corners with their points in the camera where these have parallax: others would give a loop a wrong scale."""
         views = []
@@ -144,16 +149,10 @@ class _Rows:
         """Each map after the first that loops join with an earlier one."""
         events = []
         for number, segment in enumerate(self.segments):
-            rows = [
-                (earlier, later)
-                for earlier, later in map(self.of, loops)
-                if self.maps[earlier] != number
-            ]
-            joining = [
-                self.keyframes[earlier].index
-                for earlier, later in rows
-                if self.maps[later] == number
-            ]
+            joining = []
+            for earlier, later in map(self.of, loops):
+                if self.maps[earlier] != number and self.maps[later] == number:
+                    joining.append(self.keyframes[earlier].index)
             if joining:
                 first = segment.keyframes[0].index
                 events.append(TrackingEvent(first, "map joined", joining[0], len(joining)))
@@ -165,14 +164,10 @@ class _Rows:
         """Poses ``(K, 4, 4)`` and units ``(K,)`` of all keyframes in the world of the first of some joined maps."""
         T, scales = self.T_map_camera.copy(), np.ones(len(self.keyframes))
         done = {int(members[0])}
-        across = [loop for loop in loops if len(set(self.maps[list(self.of(loop))])) == 2]
+        across = [loop for loop in loops if len(self._maps_of(loop)) == 2]
         across.sort(key=lambda loop: -loop.inliers)
         while len(done) < len(members):
-            loop = next(
-                loop
-                for loop in across
-                if len(done & set(self.maps[list(self.of(loop))].tolist())) == 1
-            )
+            loop = next(loop for loop in across if len(done & self._maps_of(loop)) == 1)
             known, new = self.of(loop)
             T_known_new, scale = loop.measured.T_from_to, loop.scale
             if int(self.maps[known]) not in done:
@@ -199,15 +194,15 @@ def _closed(
     closed, wrong = [], []
     for number in np.unique(group):
         members = np.flatnonzero(group == number)
-        inside = [
-            loop for loop, (earlier, _) in zip(loops, ends, strict=True) if group[earlier] == number
-        ]
+        inside = list(compress(loops, group[ends[:, 0]] == number))
         if not inside:
             closed += [rows.segments[member] for member in members]
             continue
         joined, kept = _joined(rows, inside, members, intrinsics)
         closed.append(joined)
-        wrong += [loop for loop, ratio in zip(inside, kept, strict=True) if ratio < _LEAST_KEPT]
+        for loop, ratio in zip(inside, kept, strict=True):
+            if ratio < _LEAST_KEPT:
+                wrong.append(loop)
     return closed, wrong
 
 

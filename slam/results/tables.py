@@ -32,6 +32,11 @@ COLUMNS = (
 )
 
 
+def headers() -> list[str]:
+    """Of the columns, in their order."""
+    return [column.name for column in COLUMNS]
+
+
 def written(value: Any, decimals: int) -> str:
     """A number with its decimals, tiny ones in powers of ten; a dash for a missing one."""
     if value is None:
@@ -45,24 +50,27 @@ def written(value: Any, decimals: int) -> str:
 def errors_table(trajectories: Mapping[str, TrajectoryMetrics], title: str = "") -> Table:
     """The main errors, a row for each trajectory; below, the reasons of missing numbers, and whether evo agrees."""
     rows = [[name, *_numbers(errors)] for name, errors in trajectories.items()]
-    found = [off for errors in trajectories.values() if (off := errors.evo.difference) is not None]
-    evo = [f"evo gives the same numbers, to {max(found):.0e}."] if found else []
-    notes = [UNITS, *evo, *missing_notes(trajectories)]
-    return Table(["trajectory", *(column.name for column in COLUMNS)], rows, title, notes)
+    notes = [UNITS]
+    differences = [errors.evo.difference for errors in trajectories.values()]
+    found = [difference for difference in differences if difference is not None]
+    if found:
+        notes.append(f"evo gives the same numbers, to {max(found):.0e}.")
+    return Table(["trajectory", *headers()], rows, title, [*notes, *missing_notes(trajectories)])
 
 
 def alignments_table(errors: TrajectoryMetrics, title: str = "") -> Table:
     """Every statistic of one trajectory under every alignment, and its snippets below."""
     statistics = AlignedMetrics.statistics()
-    values = {how: [errors.at(f"align.{how}.{key}") for key in statistics] for how in ALIGNMENTS}
-    rows = [
-        [
-            how,
-            *(written(value, each.decimals) for (value, _), each in zip(row, statistics.values())),
-        ]
-        for how, row in values.items()
-    ]
-    missing = {reason: None for row in values.values() for value, reason in row if value is None}
+    rows: list[list[str]] = []
+    missing: dict[str, None] = {}
+    for how in ALIGNMENTS:
+        row: list[str] = [how]
+        for key, statistic in statistics.items():
+            value, reason = errors.at(f"align.{how}.{key}")
+            row.append(written(value, statistic.decimals))
+            if value is None:
+                missing[reason] = None
+        rows.append(row)
     snippets, evo = errors.snippet5, errors.evo
     notes = [
         f"Snippets of five frames: ATE {written(snippets.ate_mean, 4)} ± {written(snippets.ate_std, 4)} m, RE "
@@ -90,12 +98,12 @@ def runs_table(runs: Sequence[tuple[Path, Metrics]]) -> Table:
             title += ", LEAK"
             notes[_LEAK] = None
         rows += [[title, each, *_numbers(found)] for each, found in errors.items()]
-        if errors:
-            notes |= {f"{name}: {note}": None for note in missing_notes(metrics.all_errors())}
-        else:
+        if not errors:
             rows.append([title, "", *[DASH] * len(COLUMNS)])
-        notes |= {f"{name}: {note}": None for note in metrics.unit_notes()}
-    head = ["run", "trajectory", *(column.name for column in COLUMNS)]
+        missing = missing_notes(metrics.all_errors()) if errors else []
+        for note in (*missing, *metrics.unit_notes()):
+            notes[f"{name}: {note}"] = None
+    head = ["run", "trajectory", *headers()]
     return Table(head, rows, "Errors against the reference", list(notes), names=2)
 
 
@@ -108,9 +116,9 @@ def runs_json(runs: Sequence[tuple[Path, Metrics]]) -> list[dict[str, Any]]:
         if metrics.failure:
             entry["reason"] = metrics.failure
         entry["leak"] = metrics.provenance.leak
-        objects.append(
-            entry | {key: tree.get(key) for key in ("sequence", "scale", "trajectories")}
-        )
+        for key in ("sequence", "scale", "trajectories"):
+            entry[key] = tree.get(key)
+        objects.append(entry)
     return objects
 
 
@@ -118,7 +126,8 @@ def missing_notes(trajectories: Mapping[str, TrajectoryMetrics]) -> list[str]:
     """A line for each reason why numbers are missing, with the trajectories that lack them."""
     names: dict[str, dict[str, None]] = {}
     for name, errors in trajectories.items():
-        for value, reason in (errors.at(column.path) for column in COLUMNS):
+        for column in COLUMNS:
+            value, reason = errors.at(column.path)
             if value is None:
                 names.setdefault(reason, {})[name] = None
     return [f"{DASH} {', '.join(without)}: {reason}." for reason, without in names.items()]
@@ -126,9 +135,14 @@ def missing_notes(trajectories: Mapping[str, TrajectoryMetrics]) -> list[str]:
 
 def missing_errors(trajectories: Mapping[str, TrajectoryMetrics]) -> str:
     """Why no trajectory has an error; empty where one has, or where there is none."""
-    values = [errors.at(column.path) for column in COLUMNS for errors in trajectories.values()]
-    missing = [reason for value, reason in values if value is None]
-    return missing[0] if values and len(missing) == len(values) else ""
+    reasons = []
+    for column in COLUMNS:
+        for errors in trajectories.values():
+            value, reason = errors.at(column.path)
+            if value is not None:
+                return ""
+            reasons.append(reason)
+    return reasons[0] if reasons else ""
 
 
 def _numbers(errors: TrajectoryMetrics) -> list[str]:

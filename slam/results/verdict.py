@@ -45,9 +45,8 @@ def verdict(metrics: Metrics) -> Verdict | None:
         *_noise(metrics),
     ]
     said += [*_rest(metrics), *([(False, scraps)] if scraps else [])]
-    signs, doubts = (
-        [words for is_sign, words in said if is_sign == wanted] for wanted in (True, False)
-    )
+    signs = [words for is_sign, words in said if is_sign]
+    doubts = [words for is_sign, words in said if not is_sign]
     return Verdict(_sentence(metrics), signs, doubts, scraps)
 
 

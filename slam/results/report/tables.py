@@ -50,11 +50,11 @@ def key_numbers(metrics: Metrics, has_map: bool) -> list[tuple[str, str, str]]:
         ("Loops accepted", metrics.loops.accepted, 0, ""),
         ("Map triangles", metrics.map.triangles if has_map else None, 0, ""),
     ]
-    return [
-        (name, number(value, decimals), unit)
-        for name, value, decimals, unit in wanted
-        if value is not None
-    ]
+    known = []
+    for name, value, decimals, unit in wanted:
+        if value is not None:
+            known.append((name, number(value, decimals), unit))
+    return known
 
 
 def what_ran(metrics: Metrics) -> Table:
@@ -105,13 +105,11 @@ def map_errors(metrics: Metrics) -> Table | None:
         rows["where the scanner looked"] = found.in_field
     rows["with one scale"] = found.with_scale
     rings = found.with_scale.by_distance if found.by_distance is None else found.by_distance
-    rows |= {
-        f"{ring.from_m:.0f} to {ring.to_m:.0f} m from the camera": ring for ring in rings or ()
-    }
-    texts = [
-        [name, *(number(each.at(path)[0], 3) for path in _MAP_ERRORS.values())]
-        for name, each in rows.items()
-    ]
+    for ring in rings or ():
+        rows[f"{ring.from_m:.0f} to {ring.to_m:.0f} m from the camera"] = ring
+    texts = []
+    for name, each in rows.items():
+        texts.append([name, *(number(each.at(path)[0], 3) for path in _MAP_ERRORS.values())])
     truth, length = _TRUTHS.get(found.truth, found.truth), number(found.evaluated_m)
     note = (
         f"Against {truth}, {length} m of the path. Map where no surface was measured is an error."
@@ -126,34 +124,28 @@ def timing(metrics: Metrics) -> Table | None:
         return None
     timed = sum(stages.values())
     total = max(metrics.timing.seconds_total or 0.0, timed, 1e-9)
-    shares = {
-        name: seconds / total
-        for name, seconds in (stages | {"between stages": total - timed}).items()
-    }
-    ordered = sorted(shares.items(), key=lambda item: -item[1])
-    rows = [
-        [name, f"{share * total:.1f}", f"{share:.0%}"]
-        for name, share in ordered
-        if share >= _LEAST_SHARE
-    ]
-    memory, processor = (
-        number(each) for each in (metrics.timing.peak_rss_mb, metrics.timing.cpu_seconds)
-    )
+    shares = {}
+    for name, seconds in (stages | {"between stages": total - timed}).items():
+        shares[name] = seconds / total
+    rows = []
+    for name, share in sorted(shares.items(), key=lambda item: -item[1]):
+        if share >= _LEAST_SHARE:
+            rows.append([name, f"{share * total:.1f}", f"{share:.0%}"])
+    memory = number(metrics.timing.peak_rss_mb)
+    processor = number(metrics.timing.cpu_seconds)
     note = f"{total:.1f} s in all, {processor} s of processor time, at most {memory} MiB of memory."
     return Table(("stage", "seconds", "share"), rows, notes=[note])
 
 
 def files(folder: Path) -> Table | None:
     """Every other file of the run with its meaning and size."""
-    rows = [
-        [
-            Markup('<a href="{}"><code>{}</code></a>').format(quote(path.name), path.name),
-            MEANINGS.get(path.name, ""),
-            f"{max(path.stat().st_size / 1000, 1):,.0f} kB",
-        ]
-        for path in sorted(folder.iterdir())
-        if path.is_file() and not path.name.startswith(".") and path.name != REPORT
-    ]
+    rows = []
+    for path in sorted(folder.iterdir()):
+        if not path.is_file() or path.name.startswith(".") or path.name == REPORT:
+            continue
+        link = Markup('<a href="{}"><code>{}</code></a>').format(quote(path.name), path.name)
+        size = f"{max(path.stat().st_size / 1000, 1):,.0f} kB"
+        rows.append([link, MEANINGS.get(path.name, ""), size])
     return Table((), rows, names=2) if rows else None
 
 

@@ -31,9 +31,8 @@ LOOP_SOURCE = "loop"  # the ``source`` of relative poses that close a loop: the 
 KEYFRAME_SOURCE = "window"  # in metrics.json
 _TRUSTED_HEIGHTS = 30.0  # largest learned depth that is used, in camera heights
 _SURFACE_STEP = 0.12  # relative depth step between neighbouring pixels of one surface
-_TIE_PX = np.float32(
-    1e-3
-)  # of two pixels equally near that right and below, on a road the nearer one
+# of two pixels equally near that right and below, on a road the nearer one
+_TIE_PX = np.float32(1e-3)
 
 
 @dataclass(frozen=True)

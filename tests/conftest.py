@@ -1,4 +1,5 @@
-"""Fixtures of every test: a quiet, repeatable environment, the folder of real recordings, a check of run folders."""
+"""Fixtures of every test: a quiet, repeatable environment, the folder of real recordings, a check of run folders, a few
+frames of the simulated street on disk, and untrained networks."""
 
 from __future__ import annotations
 
@@ -6,6 +7,7 @@ import gc
 import json
 import os
 import random
+import shutil
 import signal
 import sys
 import tempfile
@@ -231,3 +233,62 @@ def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.Tes
         (name, said.encode("utf-8", "backslashreplace").decode()) for name, said in report.sections
     ]
     return report
+
+
+@pytest.fixture(scope="session")
+def kitti_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A KITTI odometry root with the one sequence ``sim``: 14 frames of simulated world 1001. Not to be changed."""
+    from slam.simulation.kitti_layout import write_kitti_root
+    from slam.simulation.options import SimulationOptions
+    from slam.simulation.street import SimulatedStreet
+
+    root = tmp_path_factory.mktemp("kitti") / "root"
+    options = SimulationOptions(route="straight", frames=14, seed=1001, width=208, height=64)
+    write_kitti_root(SimulatedStreet(options), root)
+    return root
+
+
+@pytest.fixture
+def copy_of_kitti_root(kitti_root: Path, tmp_path: Path) -> Callable[[], Path]:
+    """Copies ``kitti_root`` to a place where a test may damage it."""
+    return lambda: shutil.copytree(kitti_root, tmp_path / "damaged")
+
+
+@pytest.fixture(scope="session")
+def write_weights() -> Callable[..., Path]:
+    """Writes small networks with random weights, as a training run would."""
+
+    def write(
+        folder: Path, trained_on: tuple[str, ...] = ("simulated/17",), sources: int = 4
+    ) -> Path:
+        import torch
+
+        from erfsfm.checkpoint import Model, build_networks, save_model
+        from erfsfm.config import NetworkConfig
+        from erfsfm.model_record import ModelRecord
+
+        torch.manual_seed(0)
+        network = NetworkConfig(
+            depth_width=0.1, pose_width=0.125, height=64, width=208, sources=sources
+        )
+        record = ModelRecord(
+            network=network, trained_on=list(trained_on), licence="none, untrained"
+        )
+        save_model(folder, Model(record, build_networks(network)))
+        return folder
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def tiny_weights(
+    tmp_path_factory: pytest.TempPathFactory, write_weights: Callable[..., Path]
+) -> Path:
+    """Small untrained networks."""
+    return write_weights(tmp_path_factory.mktemp("weights"))
+
+
+@pytest.fixture
+def leaky_weights(tmp_path: Path, write_weights: Callable[..., Path]) -> Path:
+    """The same, recorded as trained on the world of ``kitti_root``."""
+    return write_weights(tmp_path / "leaky", ("simulated/1000-1100",))

@@ -9,7 +9,8 @@ import numpy as np
 
 from slam.frames import Frame, Intrinsics
 from slam.frontend.keyframes.odometry import KeyframeOdometry
-from slam.geometry.se3 import FloatArray, from_rotation_vector, invert
+from slam.frontend.keyframes.relative_poses import KeyframePoses, chained
+from slam.geometry.se3 import FloatArray, from_rotation_vector, invert, rotation_angle, umeyama
 
 INTRINSICS = Intrinsics(width=320, height=240, fx=290.0, fy=290.0, cx=159.5, cy=119.5)
 FAR, NEAR = 4.0, 1.8
@@ -84,3 +85,27 @@ def tracked(
         odometry.follow(view)
         odometry.learn(view, depth_map(T))
     return odometry
+
+
+def there_and_back(frames: int, roll: float = 0.0, closer: float = 0.0) -> FloatArray:
+    """A walk down along both walls, turning away from the start, and back to it, rolled and closer."""
+    phase = np.linspace(0.0, 1.0, frames)
+    away = np.sin(np.pi * phase)
+    centres = np.column_stack([0.2 * np.sin(4 * np.pi * phase), 1.3 * away, closer * phase])
+    turns = np.column_stack([-0.35 * away, 0.02 * np.sin(9.0 * phase), roll * phase])
+    return from_rotation_vector(turns, centres)
+
+
+def errors(found: KeyframePoses, truth: FloatArray) -> tuple[float, float]:
+    """Of the last map: root mean square of aligned positions, largest of rotations since its first frame in degrees."""
+    last = max(found.segments.values())
+    poses = [pose for pose in found.poses if found.segments[pose.to_index] == last]
+    T = chained(poses)
+    frames = sorted(T)
+    estimate, true = np.stack([T[k] for k in frames]), truth[frames]
+    similarity = umeyama(true[:, :3, 3], estimate[:, :3, 3], with_scale=True)
+    aligned = similarity.apply_to_poses(estimate)
+    distance = np.linalg.norm(aligned[:, :3, 3] - true[:, :3, 3], axis=1)
+    since_first = true[0, :3, :3].T @ true[:, :3, :3]
+    turned = rotation_angle(np.swapaxes(estimate[:, :3, :3], 1, 2) @ since_first)
+    return float(np.sqrt((distance**2).mean())), float(np.rad2deg(turned).max())

@@ -246,21 +246,19 @@ def check_output(output: Path, drives: Sequence[Drive]) -> None:
 
 def summary_table(outcomes: Sequence[Outcome]) -> Table:
     """The main numbers of the runs that are whole, and why others failed."""
-    shown = {name: decimals for name, (_, decimals) in _COLUMNS.items() if decimals is not None}
-    rows = [
-        [
-            row["drive"],
-            row["status"],
-            *(written(row[name], decimals) for name, decimals in shown.items()),
-        ]
-        for row in map(_row, outcomes)
-        if row["status"] != "failed"
-    ]
-    notes = [
-        f"{outcome.drive.name} failed: {outcome.reason}"
-        for outcome in outcomes
-        if outcome.status == "failed"
-    ]
+    shown: dict[str, int] = {}
+    for name, (_, decimals) in _COLUMNS.items():
+        if decimals is not None:
+            shown[name] = decimals
+    rows = []
+    notes = []
+    for outcome in outcomes:
+        if outcome.status == "failed":
+            notes.append(f"{outcome.drive.name} failed: {outcome.reason}")
+            continue
+        row = _row(outcome)
+        numbers = (written(row[name], decimals) for name, decimals in shown.items())
+        rows.append([row["drive"], row["status"], *numbers])
     return Table(
         ["drive", "status", *(name.replace("_", "\n", 1) for name in shown)], rows, notes=notes
     )
@@ -283,10 +281,9 @@ def _of_data_set(root: Path, sequences: Sequence[str], options: Sequence[str]) -
 def _manifest(path: Path, options: Sequence[str]) -> list[Drive]:
     try:
         lines = io.StringIO(read_text(path), newline="")
-        rows = [
-            {key: word for key, word in row.items() if word}
-            for row in csv.DictReader(lines, skipinitialspace=True)
-        ]
+        rows = []
+        for row in csv.DictReader(lines, skipinitialspace=True):
+            rows.append({key: word for key, word in row.items() if word})
     except FileNotFoundError as error:
         raise SequenceError(f"no manifest {path}: check the path") from error
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -315,12 +312,10 @@ def _drive(row: dict[str, str], path: Path, where: str, options: Sequence[str]) 
         raise SequenceError(
             f"{where}: options are not understood ({error}): write them as on a command line"
         ) from error
-    named = [
-        word
-        for key in ("dataset", "sequence", "camera")
-        if key in row
-        for word in (f"--{key}", row[key])
-    ]
+    named = []
+    for key in ("dataset", "sequence", "camera"):
+        if key in row:
+            named += [f"--{key}", row[key]]
     name = row.get("name") or row.get("sequence") or Path(row["dataset"]).stem
     return Drive(name, path.absolute().parent, (*named, *options, *own))
 
@@ -358,7 +353,9 @@ def _row(outcome: Outcome) -> dict[str, Any]:
     if outcome.status == "failed":
         return row | dict.fromkeys(_COLUMNS)
     metrics = RunFolder(outcome.folder).metrics()
-    return row | {name: value(metrics) for name, (value, _) in _COLUMNS.items()}
+    for name, (value, _) in _COLUMNS.items():
+        row[name] = value(metrics)
+    return row
 
 
 def _end_with_the_worker() -> None:
@@ -367,9 +364,8 @@ def _end_with_the_worker() -> None:
     os.kill(os.getpid(), signal.SIGTERM)
 
 
-if (
-    __name__ == "__main__"
-):  # LOCK run ...: a drive, which ends when its standard input does; no two to one folder
+# LOCK run ...: a drive, which ends when its standard input does; no two to one folder
+if __name__ == "__main__":
     lock = Path(sys.argv.pop(1)).open("w", encoding="utf-8")  # noqa: SIM115 - held until the process ends
     fcntl.flock(lock, fcntl.LOCK_EX)
     threading.Thread(target=_end_with_the_worker, daemon=True).start()

@@ -403,7 +403,8 @@ def calibrate(
 
     Example: erfsfm-slam calibrate board.mp4 --board 9x6 --square-m 0.03 --output camera.yaml
     """
-    from slam.commands.calibration import Board, calibrate_camera, parse_board
+    from slam.commands.calibration import calibrate_camera
+    from slam.sequences.board import Board, parse_board
 
     wanted = Board(*parse_board(board), square_m, pattern, dictionary, marker_share)
     with progress_bar() as progress:
@@ -479,7 +480,9 @@ def doctor(
 
 def _print_run(folder: RunFolder) -> None:
     """The errors of a run, what raises doubt, and where everything is."""
-    from slam.results.tables import by_reason, errors_table, verdict, written
+    from slam.results.report.tables import by_reason
+    from slam.results.tables import errors_table, written
+    from slam.results.verdict import verdict
     from slam.runtime.files import REPORT
 
     metrics = folder.metrics()

@@ -155,9 +155,8 @@ class _RemoteZip:
         try:
             yield
         except broken as error:
-            if isinstance(
-                error.__context__, ValueError
-            ):  # what requests says of an address without server
+            # what requests says of an address without server
+            if isinstance(error.__context__, ValueError):
                 raise SlamError(
                     f"{self.url} is no address: give --mirror as https://HOST/FOLDER"
                 ) from error

@@ -45,9 +45,12 @@ def against_reference(
         typer.echo(json.dumps([run.tree() for run in runs], indent=2))
     else:
         notes = [tables.UNITS, *tables.missing_notes({run.system: run.errors for run in runs})]
-        head = ["system", "poses", *(column.name for column in tables.COLUMNS)]
+        head = ["system", "poses", *tables.headers()]
         Table(head, list(_rows(runs)), f"Errors against {reference}", notes).print()
-    if broken := [f"{run.path}: {line}" for run in runs for line in exceeded(run.errors, limits)]:
+    broken = []
+    for run in runs:
+        broken += [f"{run.path}: {line}" for line in exceeded(run.errors, limits)]
+    if broken:
         raise SlamError("; ".join(broken))
 
 
@@ -179,9 +182,11 @@ def _rows(runs: Sequence[SystemRun]) -> Iterator[list[str]]:
 
 def _spread(column: tables.ErrorColumn, runs: Sequence[SystemRun]) -> str:
     """The number of one run; of several the mean and the deviation of those that have it."""
-    values = [
-        value for value in (run.errors.at(column.path)[0] for run in runs) if value is not None
-    ]
+    values = []
+    for run in runs:
+        value, _ = run.errors.at(column.path)
+        if value is not None:
+            values.append(value)
     if len(values) < 2:
         return tables.written(values[0] if values else None, column.decimals)
     mean, deviation = float(np.mean(values)), float(np.std(values, ddof=1))

@@ -37,9 +37,8 @@ from slam.sequences.recording import frame_range
 _PLACES_TRIED = 8
 _STARTS = 3  # of these are refined
 _PLACES_AROUND = 12  # around the pose, whose points are looked for in the image
-_MOST_DIFFERING = (
-    50  # bits of descriptors where the pose is known: less sure matches pull it towards itself
-)
+# bits of descriptors where the pose is known: less sure matches pull it towards itself
+_MOST_DIFFERING = 50
 _SAMPLES = 300  # of RANSAC
 _LEAST_POINTS = 8  # of a place, to try it
 _LEAST_INLIERS = 30
@@ -107,9 +106,8 @@ def localise(
         )
     if camera is None:
         folder = images if images.is_dir() else images.parent
-        own_camera = beside(
-            paths[0].parent, folder, folder.absolute().parent
-        )  # where ``run`` looks
+        # where ``run`` looks
+        own_camera = beside(paths[0].parent, folder, folder.absolute().parent)
     else:
         own_camera = explicit_camera(camera, ImageFiles(in_order(paths)))
     if own_camera is None and places.intrinsics.undistorted:

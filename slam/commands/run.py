@@ -32,17 +32,12 @@ from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline
 from slam.prediction.assembly import Prediction, open_prediction
 from slam.prediction.depth_source import FrameNumbers
-from slam.results.estimate_metrics import (
-    DepthQuality,
-    estimate_metrics,
-    lidar_trajectory,
-    map_errors,
-    timing_of,
-)
+from slam.results.estimate_metrics import estimate_metrics, lidar_trajectory, timing_of
 from slam.results.folder import RunFolder, RunLog, check_output, run_log
 from slam.results.metrics import MapMetrics, Metrics, Provenance
 from slam.results.report.page import DepthPictures, Picture, loop_pictures, write_report
 from slam.results.report.rerun import write_rerun
+from slam.results.truth_errors import DepthQuality, map_errors
 from slam.runtime.errors import EmptyMapError, Failed, RunError, SlamError, attempt
 from slam.runtime.files import (
     CONFIG,
@@ -57,7 +52,7 @@ from slam.runtime.files import (
 )
 from slam.runtime.imports import import_extra
 from slam.sequences.catalogue import open_sequence
-from slam.sequences.poses import read_gps
+from slam.sequences.gps_track import read_gps
 
 logger = logging.getLogger(__name__)
 
@@ -307,9 +302,8 @@ def perform(request: RunRequest) -> RunFolder:
             request.dataset, request.sequence, request.camera, request.frames, request.truth
         )
         lens, camera = recording.undistortion, recording.intrinsics
-        numbers = FrameNumbers(
-            len(recording), recording.start, recording.recorded
-        )  # by which files of depth are found
+        # by which files of depth are found
+        numbers = FrameNumbers(len(recording), recording.start, recording.recorded)
         undistort = None if lens is None else lens.apply_to_depth
         prediction = open_prediction(
             request.weights, request.device, settings.depth, camera, numbers, undistort
@@ -357,9 +351,8 @@ def record(
 def provenance_of(request: Request, prediction: Prediction, recording: FrameSequence) -> Provenance:
     """The input of a run: networks, depth, and the options that name the recording."""
     networks, source = prediction.networks, prediction.source
-    is_folder = Path(request.weights) == Path(
-        networks.origin
-    )  # else a shipped name, whatever lies here
+    # else a shipped name, whatever lies here
+    is_folder = Path(request.weights) == Path(networks.origin)
     return Provenance(
         version=__version__,
         commit=commit(),

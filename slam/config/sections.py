@@ -19,10 +19,8 @@ from slam.runtime.errors import ConfigError
 from slam.runtime.imports import plug_ins
 
 _HERE = Path(__file__).resolve().parents[1]
-_SHIPPED = (
-    _HERE.parent / "configs" / "slam",
-    _HERE / "_configs",
-)  # in the source tree, in the wheel
+# in the source tree, in the wheel
+_SHIPPED = (_HERE.parent / "configs" / "slam", _HERE / "_configs")
 dump_yaml = dump_explained  # with the description of every key
 DEPTH_SOURCES = ("onnx", "npy", "png")
 DEPTH_PLUG_INS = "erfsfm_slam.depth"  # entry points of other packages: see docs/depth.md

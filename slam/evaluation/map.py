@@ -43,11 +43,8 @@ COVERED_WITHIN_M = 0.3
 F_SCORES_M = {"0.2": 0.2, "0.5": 0.5}
 BINS_M = ((0.0, 5.0), (5.0, 10.0), (10.0, 15.0), (15.0, 20.0), (20.0, 25.0))
 OUTLIER_M = 1.0
-VIEW_STEP_M, SPARSE_VIEW_STEP_M, VIEW_STEP_DEG = (
-    1.0,
-    3.0,
-    5.0,
-)  # sparse where views do not measure the accuracy
+# sparse where views do not measure the accuracy
+VIEW_STEP_M, SPARSE_VIEW_STEP_M, VIEW_STEP_DEG = (1.0, 3.0, 5.0)
 SAMPLE_VOXEL_M = 0.2
 
 _WALL_NEAR_M, _WALL_FAR_M = 0.3, 2.0  # of the second surface in front of the first
@@ -59,6 +56,17 @@ _LEAF_POINTS = 32  # of the tree of true surface: less memory than with 16
 _NO_MAP = Failed("no map point lies within 25 m of a camera whose surroundings are known")
 _NO_SURFACE = Failed("no true surface is known at this distance from a camera")
 _FEW = Failed("too few points at this distance from a camera")
+ERRORS = (
+    "accuracy_median_m",
+    "accuracy_90_m",
+    "outlier_share",
+    "completeness",
+    "f_score",
+    "precision",
+    "recall",
+    "in_field",
+    "by_distance",
+)
 
 
 @dataclass(frozen=True)
@@ -187,18 +195,6 @@ class PlacedMetrics(SurfaceMetrics):
     scale: float | None = None
 
 
-ERRORS = (
-    *(
-        "accuracy_median_m",
-        "accuracy_90_m",
-        "outlier_share",
-        "completeness",
-        "f_score",
-        "precision",
-        "recall",
-    ),
-    *("in_field", "by_distance"),
-)
 """The values of every `PlacedMetrics`."""
 
 
@@ -259,9 +255,8 @@ def compare(
     for stretch in parts:
         positions = T_world_camera[:, :3, 3]
         away_from_stretch, _ = cKDTree(positions[stretch]).query(positions[views])
-        near = views[
-            away_from_stretch <= 2 * RANGE_M
-        ]  # the views that can see surfaces near the stretch
+        # the views that can see surfaces near the stretch
+        near = views[away_from_stretch <= 2 * RANGE_M]
         to_surface, on_surface, surface_range = _surface_along(
             truth, near, T_world_camera, cameras, stretch
         )

@@ -18,18 +18,12 @@ from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import RunError
 from slam.runtime.files import write_atomically
 
-_TYPES = {
-    "double": "f8",
-    "float": "f4",
-    "uchar": "u1",
-    "int": "i4",
-    "uint": "u4",
-}  # that Open3D and we write
+# that Open3D and we write
+_TYPES = {"double": "f8", "float": "f4", "uchar": "u1", "int": "i4", "uint": "u4"}
 _NAMES = {kind: name for name, kind in _TYPES.items()}
 _AXES, _NORMALS, _COLOURS = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
-R_UP_WORLD = np.array(
-    [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
-)  # x right, y ahead, z up
+# x right, y ahead, z up
+R_UP_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _TRIANGLE = np.dtype([("count", "u1"), ("vertices", "<u4", (3,))])
 
 

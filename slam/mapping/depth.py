@@ -60,9 +60,10 @@ class DepthFilters:
     def __init__(self, config: MappingConfig, intrinsics: Intrinsics) -> None:
         """For depth maps of the size of the intrinsics."""
         self._config, self._camera = config, intrinsics
+        # (3, H*W) with z = 1
         self._rays = np.ascontiguousarray(
             intrinsics.rays(intrinsics.pixel_grid()).reshape(-1, 3).T, dtype=np.float32
-        )  # (3, H*W) with z = 1
+        )
         height, width = intrinsics.height, intrinsics.width
         border, self._above_hood = round(_BORDER * width), np.ones((height, width), dtype=bool)
         self._top_rows = border + 1

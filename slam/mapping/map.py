@@ -17,11 +17,10 @@ from slam.mapping.depth import MOST_RELATIVE_SIGMA, DepthFilters, KeyframeDepth
 from slam.mapping.submap import BLOCK_VOXELS, Fusion, SpilledSubmap, ViewChooser
 from slam.mapping.surface import MapSurface
 from slam.runtime.errors import EmptyMapError
-from slam.runtime.resources import SpillFile
+from slam.runtime.spill_file import SpillFile
 
-_FUSION_SHARE = (
-    0.25  # of the memory: growing needs twice the blocks, and the rest of the map has its own
-)
+# of the memory: growing needs twice the blocks, and the rest of the map has its own
+_FUSION_SHARE = 0.25
 _BLOCK_MB = BLOCK_VOXELS * 8 / 2**20
 _SUBMAP_LENGTH = 3.0  # largest depths after which a submap ends: 60 m of a street
 _EARLIER = 3  # views between one and that which tells what has come since

@@ -21,7 +21,7 @@ from slam.frames import DepthMap, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, apply, invert, rotation_angle
 from slam.mapping.depth import DepthFilters, KeyframeDepth, sampled
 from slam.runtime.imports import import_open3d
-from slam.runtime.resources import SpilledArray
+from slam.runtime.spill_file import SpilledArray
 
 Keys = NDArray[np.int64]
 SpilledSubmap = dict[str, SpilledArray]  # the fields of a `Submap` on disk
@@ -29,9 +29,8 @@ SpilledSubmap = dict[str, SpilledArray]  # the fields of a `Submap` on disk
 BLOCK_SIDE = 16
 BLOCK_VOXELS = BLOCK_SIDE**3
 TILE_BLOCKS = 16
-SEED_STRIDE = (
-    4  # Open3D activates blocks at these pixels only, and raises where none of them has depth
-)
+# Open3D activates blocks at these pixels only, and raises where none of them has depth
+SEED_STRIDE = 4
 TRUNCATION_VOXELS = 10.0  # of the signed distance: 4 lose completeness, 12 accuracy (docs/design/tried-without-success)
 _CAPACITY = 1000  # blocks of 32 KiB; growing takes Open3D a moment
 _MOST_WEIGHT = np.iinfo(np.uint16).max
@@ -234,9 +233,8 @@ class ViewChooser:
         if self._begin is None:
             self._begin = view.T_world_camera
         grey = _grey(view.image)
-        sharpness = float(
-            cv2.Laplacian(grey, cv2.CV_64F).var() / (grey.var() + 1.0)
-        )  # contrast does not count
+        # contrast does not count
+        sharpness = float(cv2.Laplacian(grey, cv2.CV_64F).var() / (grey.var() + 1.0))
         if self._best is None or sharpness > self._best[0]:
             self._best = sharpness, replace(view, depth=kept, relative_sigma=None)
 

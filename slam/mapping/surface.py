@@ -35,7 +35,7 @@ from slam.mapping.submap import (
 )
 from slam.runtime.errors import EmptyMapError
 from slam.runtime.imports import import_open3d
-from slam.runtime.resources import SpilledArray, SpillFile
+from slam.runtime.spill_file import SpilledArray, SpillFile
 
 _LEAST_WEIGHT = 1.0  # observations of a voxel that becomes surface
 _LEAST_TRIANGLES = 300  # of a connected piece; smaller ones float
@@ -248,9 +248,8 @@ class TileSurface:
         """Unit normals ``(V, 3)``: means of the triangles around each vertex, by their area."""
         o3d = import_open3d()
         vertices = o3d.utility.Vector3dVector(self.vertices)
-        triangles = o3d.utility.Vector3iVector(
-            self.triangles.astype(np.int32)
-        )  # others are converted one by one
+        # others are converted one by one
+        triangles = o3d.utility.Vector3iVector(self.triangles.astype(np.int32))
         return np.asarray(
             o3d.geometry.TriangleMesh(vertices, triangles).compute_vertex_normals().vertex_normals
         )
@@ -310,15 +309,13 @@ def _sorted(vertices: FloatArray, triangles: Triangles) -> tuple[FloatArray, Tri
     """The same mesh in an order that does not depend on Open3D's threads."""
     order = np.lexsort(vertices.T)
     differs = (np.diff(vertices[order], axis=0) != 0).any(axis=1)
-    if (
-        not differs.all()
-    ):  # several vertices in one place: by the places that the triangles around them reach
+    # several vertices in one place: by the places that the triangles around them reach
+    if not differs.all():
         place = np.empty_like(order)
         place[order] = np.append(0, np.cumsum(differs))
         reached = np.zeros(len(vertices), dtype=np.int64)
-        np.add.at(
-            reached, triangles, (place[triangles] ** 2).sum(axis=1)[:, None]
-        )  # of integers, in any order
+        # of integers, in any order
+        np.add.at(reached, triangles, (place[triangles] ** 2).sum(axis=1)[:, None])
         order = np.lexsort((reached, *vertices.T))
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))

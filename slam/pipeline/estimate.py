@@ -31,7 +31,7 @@ from slam.mapping.depth import DepthRefiner, KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.mapping.submap import moved_rows
 from slam.runtime.errors import Failed
-from slam.runtime.resources import Stopwatch
+from slam.runtime.stopwatch import Stopwatch
 
 # relative sigma of learned depth in rooms, in the unit of the drive: 90 % of the errors are within 1.645 sigmas
 _ROOM_SIGMA = 0.32

@@ -25,17 +25,18 @@ from slam.frames import (
     resized_mask,
 )
 from slam.frontend.drive import Drive, Keyframe
-from slam.frontend.ground_plane import GroundPlaneFitter
 from slam.frontend.image_gate import ImageGate, Verdict
-from slam.frontend.road import RoadHomography, RoadStep
+from slam.frontend.road import GroundPlaneFitter, RoadHomography, RoadStep
 from slam.frontend.tracking import ROTATION_BASELINE
 from slam.frontend.visual.motion import Motion, path_between, shortest_by_start
 from slam.frontend.visual.odometry import VisualOdometry
 from slam.geometry.se3 import chain, is_se3
 from slam.loops.features import FeatureExtractor
-from slam.pipeline.keyframe_maps import KeyframeTracking
+from slam.pipeline.front_end_choice import KeyframeTracking
 from slam.runtime.errors import Failed, MissingFrameError, SequenceError, SlamError
-from slam.runtime.resources import SpillFile, Stopwatch, return_freed_memory
+from slam.runtime.memory import return_freed_memory
+from slam.runtime.spill_file import SpillFile
+from slam.runtime.stopwatch import Stopwatch
 
 logger = logging.getLogger(__name__)
 
@@ -43,9 +44,8 @@ _NO_POSE = "its pose is no finite rigid transform and leaves a gap"
 _MOVED_ON_HEIGHTS = 1.5  # way of the camera after which depth is predicted again, camera heights
 _LAST_ROADS = 8  # looked back for the camera's height, frames
 _MOST_UNREAD = 30  # unreadable images in a row: three seconds at 10 Hz, beyond which the motion cannot be guessed
-_LOOP_STRIDE = (
-    4  # frames between views for loops: a car goes some 4 m, still the same place to a descriptor
-)
+# frames between views for loops: a car goes some 4 m, still the same place to a descriptor
+_LOOP_STRIDE = 4
 
 
 @dataclass
@@ -136,9 +136,8 @@ class Observer:
         if index % 200 == 0:  # 24 MB
             return_freed_memory()
         if isinstance(frame, SequenceError):
-            is_missing = (
-                isinstance(frame, MissingFrameError) and self._config.gaps.enabled
-            )  # never ends a run
+            # never ends a run
+            is_missing = isinstance(frame, MissingFrameError) and self._config.gaps.enabled
             self._unread += not is_missing
             if not (is_missing or self._is_gap(self._unread)):
                 raise frame
@@ -410,9 +409,8 @@ class Observer:
     def _finish_tasks(self, stage: str | None = None) -> None:
         """Wait for the tasks of the last frame, or for those of one stage alone."""
         tasks = [task for task in self._tasks if stage in (None, task.stage)]
-        self._tasks = [
-            task for task in self._tasks if task not in tasks
-        ]  # so that a failed one is not raised again
+        # so that a failed one is not raised again
+        self._tasks = [task for task in self._tasks if task not in tasks]
         for task in tasks:
             with self._stopwatch.stage(task.stage):
                 result = task.result.result()

@@ -43,11 +43,11 @@ from slam.mapping.depth import KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.pipeline.checks import require_possible, warn_of_doubts, warn_of_images
 from slam.pipeline.estimate import Estimate, Odometry, fuse
-from slam.pipeline.keyframe_maps import close_maps
+from slam.pipeline.map_closure import close_maps
 from slam.pipeline.observer import Observer
 from slam.runtime.errors import Failed, SequenceError, SlamError, attempt
 from slam.runtime.imports import import_open3d_beside
-from slam.runtime.resources import Stopwatch
+from slam.runtime.stopwatch import Stopwatch
 from slam.sequences.recording import RecordedSequence
 
 logger = logging.getLogger(__name__)
@@ -353,9 +353,8 @@ class SlamPipeline:
         """Agreements of all sources and of the images, and what follows from them."""
         drive, scale, by_sources = odometry.drive, odometry.scale, list(odometry.agreements)
         if self._fixes is not None and (by_gps := self._fixes.agreement) is not None:
-            by_sources.append(
-                by_gps if by_gps.is_wrong else by_gps.said()
-            )  # why it is not used was said
+            # why it is not used was said
+            by_sources.append(by_gps if by_gps.is_wrong else by_gps.said())
         needs_road = scale.unit in ("metres", "camera heights")
         of_images = agreement.of_images(
             drive, self.sequence.intrinsics, scale.contradicted, needs_road

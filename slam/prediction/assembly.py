@@ -40,9 +40,10 @@ class NetworkPredictor:
     def depth(self, frame: Frame) -> DepthMap:
         """Unscaled z-depth ``(H, W)`` at the image's size."""
         height, width = frame.image.shape[:2]
+        # (h, w) of the networks
         disparity = frame.derived(
             (self._key, "disparity"), lambda: self._networks.disparity(self._prepared(frame))
-        )  # (h, w) of the networks
+        )
         return depth_at(disparity, height, width)
 
     def snippet(self, frames: Sequence[Frame]) -> SnippetPoses:

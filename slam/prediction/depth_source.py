@@ -46,9 +46,8 @@ _LEAST_COMPARED = 50
 _REWEIGHTINGS = 8
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_HEADER_BYTES = 26
-Undistort = Callable[
-    [DepthMap], DepthMap
-]  # z-depth (H, W) of a stored image to that of the undistorted one
+# z-depth (H, W) of a stored image to that of the undistorted one
+Undistort = Callable[[DepthMap], DepthMap]
 _MOST_BYTES = 2**31  # of a message of Protocol Buffers
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 _OWN_INPUT = "RGB in [-1, 1]"  # as `erfsfm export` writes it into the metadata
@@ -432,9 +431,8 @@ class OnnxDepth:
                 f"{self._path} is damaged or no ONNX file ({error}): copy or export it again"
             ) from error
         try:
-            convert_model_from_external_data(
-                model
-            )  # marks weights in other files as read, or finds that they are not
+            # marks weights in other files as read, or finds that they are not
+            convert_model_from_external_data(model)
         except ValueError as error:
             reason = "keeps weights in other files, which are not read: save it as one file"
             raise SlamError(f"{self._path} {reason}") from error

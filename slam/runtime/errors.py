@@ -69,7 +69,6 @@ def attempt(stage: str, compute: Callable[[], T]) -> T | Failed:
         if shows_traceback() or isinstance(error, OSError) or isinstance(error.__cause__, OSError):
             raise
         reason = f"{stage} failed: {explained(error)}"
-        logger.warning(
-            f"the run goes on without: {reason}"
-        )  # each in words of its own, so that none is only counted
+        # each in words of its own, so that none is only counted
+        logger.warning(f"the run goes on without: {reason}")
         return Failed(reason)

@@ -105,9 +105,8 @@ class Record(BaseModel):
         """
         try:
             content = json.loads(read_text(path))
-            json.dumps(
-                content, ensure_ascii=False
-            ).encode()  # half a surrogate pair cannot be printed
+            # half a surrogate pair cannot be printed
+            json.dumps(content, ensure_ascii=False).encode()
             return cls.model_validate(content)
         except FileNotFoundError:
             raise

@@ -117,14 +117,12 @@ class Bag:
         """The stamp in nanoseconds of a message as stored whose first field is a header, without reading all of it."""
         with self._errors():
             if self._is_ros1:
-                seconds, nanoseconds = struct.unpack_from(
-                    "<II", data, 4
-                )  # after the sequence number
+                # after the sequence number
+                seconds, nanoseconds = struct.unpack_from("<II", data, 4)
             else:
                 order = "<" if data[1] & 1 else ">"
-                seconds, nanoseconds = struct.unpack_from(
-                    f"{order}iI", data, 4
-                )  # after the encapsulation
+                # after the encapsulation
+                seconds, nanoseconds = struct.unpack_from(f"{order}iI", data, 4)
         return int(seconds) * _NANOSECONDS + int(nanoseconds)
 
     def close(self) -> None:

@@ -33,7 +33,13 @@ from slam.sequences.camera_file import as_known
 from slam.sequences.images import ReadImages
 from slam.sequences.loader import IMAGES, VIDEO, Asked, Loader, Opener
 from slam.sequences.poses import read_truth
-from slam.sequences.recording import RecordedSequence, Source, frame_range, uniform_stamps
+from slam.sequences.recording import (
+    ArrayReader,
+    RecordedSequence,
+    Source,
+    frame_range,
+    uniform_stamps,
+)
 from slam.simulation.kitti_layout import simulated_world
 from slam.simulation.options import SimulationOptions
 
@@ -108,7 +114,7 @@ def open_sequence(
 @sequence_errors()
 def sequence_kinds(dataset: Path) -> dict[str, str]:
     """The sequences of a data set by name, and the kind of each; empty where it is of no known kind."""
-    return {name: kind for name, (kind, _) in _contents(_root(dataset, None), Asked()).items()}
+    return _kinds(_contents(_root(dataset, None), Asked()))
 
 
 def _root(dataset: Path | None, name: str | None) -> Path:
@@ -134,10 +140,15 @@ def _root(dataset: Path | None, name: str | None) -> Path:
 def _contents(root: Path, asked: Asked) -> dict[str, tuple[str, Opener]]:
     """Kind and opener of what a path holds, pieces of one recording as one; empty where nothing is of a known kind."""
     found = _parts(root, asked)
-    for pieces in find_series({name: kind for name, (kind, _) in found.items()}):
-        kind, openers = found[pieces[0].name][0], [found.pop(piece.name)[1] for piece in pieces]
+    for pieces in find_series(_kinds(found)):
+        kind, _ = found[pieces[0].name]
+        openers = [found.pop(piece.name)[1] for piece in pieces]
         found[pieces[0].name] = kind, partial(open_series, pieces, openers)
     return found
+
+
+def _kinds(contents: Mapping[str, tuple[str, Opener]]) -> dict[str, str]:
+    return {name: kind for name, (kind, _) in contents.items()}
 
 
 def _parts(root: Path, asked: Asked) -> dict[str, tuple[str, Opener]]:
@@ -145,15 +156,13 @@ def _parts(root: Path, asked: Asked) -> dict[str, tuple[str, Opener]]:
     found = _recognised(root, asked)
     if found or root.is_file():
         return found
-    for child in sorted(
-        path for path in root.iterdir() if path.is_dir() and not path.name.startswith(".")
-    ):
+    for child in sorted(root.iterdir()):
+        if not child.is_dir() or child.name.startswith("."):
+            continue
         with suppress(DataError, SequenceError):  # a folder that is refused when it is given
             inside = _recognised(child, Asked(None, asked.camera))
-            found |= {
-                child.name if len(inside) == 1 else f"{child.name}/{name}": inside[name]
-                for name in inside
-            }
+            for name, content in inside.items():
+                found[child.name if len(inside) == 1 else f"{child.name}/{name}"] = content
     return found
 
 
@@ -318,6 +327,15 @@ def open_series(pieces: Sequence[Piece], openers: Sequence[Opener]) -> RecordedS
         for part in parts
     ]
 
+    sources = []
+    scans: dict[int, ArrayReader] = {}
+    for start, part in zip(starts, parts, strict=True):
+        for source in part.sources:
+            begin = source.first or 0
+            sources.append(replace(source, first=begin - start, length=begin + len(part)))
+        for k, scan in part.scans.items():
+            scans[start + k] = scan
+
     def read(index: int) -> Image:
         place = int(np.searchsorted(ends, index, side="right"))
         return parts[place].images.read(index - starts[place])
@@ -327,21 +345,13 @@ def open_series(pieces: Sequence[Piece], openers: Sequence[Opener]) -> RecordedS
         images=ReadImages(first.images.width, first.images.height, int(ends[-1]), read),
         camera=first.camera,
         stamps=_stamps(pieces, [part.stamps for part in parts]),
-        sources=tuple(
-            replace(
-                source, first=(source.first or 0) - start, length=(source.first or 0) + len(part)
-            )
-            for start, part in zip(starts, parts)
-            for source in part.sources
-        ),
+        sources=tuple(sources),
         T_any_camera=np.concatenate(poses)
         if any(part.T_any_camera is not None for part in parts)
         else None,
         usual_height_m=first.camera_height_m,
         T_camera_lidar=first.T_camera_lidar,
-        scans={
-            start + k: scan for start, part in zip(starts, parts) for k, scan in part.scans.items()
-        },
+        scans=scans,
     )
 
 

@@ -23,14 +23,8 @@ from erfsfm.common.readers.camera_file import CameraFile, camera_of
 from erfsfm.common.readers.images import first_size, has_images, list_images, read_depth_map
 from erfsfm.common.readers.kitti import read_velodyne
 from erfsfm.common.readers.numbering import NumberedFiles, by_name, by_table
-from slam.formats.trajectory import (
-    BadRows,
-    in_seconds,
-    nearest_stamps,
-    number_or_nan,
-    read_trajectory,
-    rows_of,
-)
+from slam.formats.rows import BadRows, in_seconds, number_or_nan, rows_of
+from slam.formats.trajectory import nearest_stamps, read_trajectory
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
@@ -69,6 +63,13 @@ _SEVEN_SCENES_IMAGE = re.compile(r"frame-(\d{6})\.color\.png")
 _NUSCENES_FPS = 12.0
 
 Row = dict[str, Any]
+# the benchmark's table of its three cameras: fx, fy, cx, cy and the distortion; images of freiburg3 are undistorted
+_FREIBURG_CAMERAS = {
+    "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": ((535.4, 539.2, 320.1, 247.6), ()),
+}
+_SCANNET_CAMERA = "intrinsic/intrinsic_color.txt"
 
 
 def _recorded(
@@ -118,11 +119,11 @@ def _index(
 
 def _depth_maps(paths: list[Path], unknown: int = 0) -> dict[int, ArrayReader]:
     """In millimetres, of the frames whose files are there."""
-    return {
-        k: partial(read_depth_map, path, 1000.0, unknown)
-        for k, path in enumerate(paths)
-        if path.is_file()
-    }
+    maps: dict[int, ArrayReader] = {}
+    for k, path in enumerate(paths):
+        if path.is_file():
+            maps[k] = partial(read_depth_map, path, 1000.0, unknown)
+    return maps
 
 
 def _truth(path: Path, stamps: FloatArray) -> FloatArray | None:
@@ -139,13 +140,12 @@ def _truth(path: Path, stamps: FloatArray) -> FloatArray | None:
 def _find_euroc(path: Path, asked: Asked) -> dict[str, Opener]:
     """The left camera, else the right one, of the sensors in ``mav0`` of a recording, or in the folder given."""
     path = path.absolute()
-    cameras = (body / name for body in (path / "mav0", path) for name in _EUROC_CAMERAS)
-    camera = next((camera for camera in cameras if (camera / "data.csv").is_file()), None)
-    return (
-        {}
-        if camera is None
-        else {camera.parents[1].name: partial(_open_euroc, camera, asked.camera)}
-    )
+    for body in (path / "mav0", path):
+        for name in _EUROC_CAMERAS:
+            camera = body / name
+            if (camera / "data.csv").is_file():
+                return {body.parent.name: partial(_open_euroc, camera, asked.camera)}
+    return {}
 
 
 def _open_euroc(camera: Path, asked: Path | None) -> RecordedSequence:
@@ -204,14 +204,6 @@ def _T_body_sensor(path: Path) -> FloatArray:
 # TUM RGB-D: rgb.txt and, where known, groundtruth.txt and depth.txt
 
 
-# the benchmark's table of its three cameras: fx, fy, cx, cy and the distortion; images of freiburg3 are undistorted
-_FREIBURG_CAMERAS = {
-    "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
-    "2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
-    "3": ((535.4, 539.2, 320.1, 247.6), ()),
-}
-
-
 def _freiburg_camera(number: str) -> CameraFile:
     pinhole, distortion = _FREIBURG_CAMERAS[number]
     lens = {"model": "opencv", "distortion": distortion} if distortion else {}
@@ -248,10 +240,8 @@ def _open_tum(folder: Path, asked: Path | None) -> RecordedSequence:
 def _near(stamps: FloatArray, known: FloatArray, within_s: float) -> list[tuple[int, int]]:
     """Frames, each with the nearest row of others if that is within so many seconds."""
     nearest = nearest_stamps(stamps, known)
-    return [
-        (int(k), int(nearest[k]))
-        for k in np.flatnonzero(np.abs(known[nearest] - stamps) <= within_s)
-    ]
+    frames = np.flatnonzero(np.abs(known[nearest] - stamps) <= within_s)
+    return list(zip(frames.tolist(), nearest[frames].tolist(), strict=True))
 
 
 # TUM mono: images/, times.txt and camera.txt with the FOV lens; true poses of the start and the end alone
@@ -276,8 +266,8 @@ def _fov_camera(path: Path, fps: float) -> CameraFile:
     try:
         first, second = read_text(path).splitlines()[:2]
         words = first.split()
-        fx, fy, cx, cy, angle = (float(word) for word in words[words[0] == "FOV" :])
-        width, height = (int(word) for word in second.split())
+        fx, fy, cx, cy, angle = map(float, words[words[0] == "FOV" :])
+        width, height = map(int, second.split())
     except (OSError, UnicodeDecodeError, ValueError, IndexError) as error:
         raise SequenceError(
             f"{path} needs a row of fx fy cx cy and the lens's angle and a row of width and height: {error}"
@@ -292,11 +282,12 @@ def _fov_camera(path: Path, fps: float) -> CameraFile:
 
 def _open_seven_scenes(folder: Path, asked: Path | None) -> RecordedSequence:
     """With the camera that the data set publishes for all."""
-    numbers = sorted(
-        int(match[1])
-        for path in folder.iterdir()
-        if (match := _SEVEN_SCENES_IMAGE.fullmatch(path.name))
-    )
+    numbers = []
+    for path in folder.iterdir():
+        match = _SEVEN_SCENES_IMAGE.fullmatch(path.name)
+        if match is not None:
+            numbers.append(int(match[1]))
+    numbers.sort()
     if not numbers:
         raise SequenceError(f"no frame-NNNNNN.color.png in {folder}: unpack the sequence")
     frames = [folder / f"frame-{k:06d}" for k in range(numbers[0], numbers[-1] + 1)]
@@ -338,9 +329,6 @@ def _open_scannet(folder: Path, asked: Path | None) -> RecordedSequence:
     )
 
 
-_SCANNET_CAMERA = "intrinsic/intrinsic_color.txt"
-
-
 def _scannet_camera(path: Path, files: NumberedFiles) -> CameraFile:
     K, (height, width) = read_matrix(path, "a camera"), first_size(files.paths)
     return camera_of(
@@ -374,12 +362,10 @@ def _open_nuscenes(root: Path, tables: Path, scene: str, asked: Path | None) -> 
         if lidar:
             (T_ego_lidar,) = _nuscenes_poses([mounts[lidar[0]["calibrated_sensor_token"]]])
             T_camera_lidar = se3.invert(T_ego_camera) @ T_ego_lidar
-            paths = {
-                k: root / lidar[row]["filename"] for k, row in _near(stamps, _times(lidar), _NEAR_S)
-            }
-            scans = {
-                k: partial(read_velodyne, path, 5) for k, path in paths.items() if path.exists()
-            }
+            for k, row in _near(stamps, _times(lidar), _NEAR_S):
+                path = root / lidar[row]["filename"]
+                if path.exists():
+                    scans[k] = partial(read_velodyne, path, 5)
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise SequenceError(
             f"the tables in {tables} are not those of nuScenes: {error!r}; copy them again"
@@ -394,14 +380,18 @@ def _scene(tables: Path, scene: str) -> tuple[dict[str, list[Row]], dict[str, Ro
     (token,) = (row["token"] for row in _table(tables, "scene") if row["name"] == scene)
     samples = {row["token"] for row in _table(tables, "sample") if row["scene_token"] == token}
     channels = {row["token"]: row["channel"] for row in _table(tables, "sensor")}
-    mounts = {row["token"]: row for row in _table(tables, "calibrated_sensor")}
+    mounts = _by_token(_table(tables, "calibrated_sensor"))
     rows: dict[str, list[Row]] = {}
     for row in sorted(_table(tables, "sample_data"), key=lambda row: float(row["timestamp"])):
         if row["sample_token"] in samples:
             rows.setdefault(
                 channels[mounts[row["calibrated_sensor_token"]]["sensor_token"]], []
             ).append(row)
-    return rows, mounts, {row["token"]: row for row in _table(tables, "ego_pose")}
+    return rows, mounts, _by_token(_table(tables, "ego_pose"))
+
+
+def _by_token(rows: list[Row]) -> dict[str, Row]:
+    return {row["token"]: row for row in rows}
 
 
 def _table(tables: Path, name: str) -> list[Row]:
@@ -429,12 +419,13 @@ def _nuscenes_poses(rows: list[Row]) -> FloatArray:
 def _find_nuscenes(path: Path, asked: Asked) -> dict[str, Opener]:
     """All scenes of all tables."""
     folders = sorted(folder for folder in path.glob("v1.0-*") if (folder / "scene.json").is_file())
-    return {
-        row["name"]: partial(_open_nuscenes, path, folder, row["name"], asked.camera)
-        for folder in folders
-        for row in _table(folder, "scene")
-        if isinstance(row, dict) and isinstance(row.get("name"), str)
-    }
+    scenes: dict[str, Opener] = {}
+    for folder in folders:
+        for row in _table(folder, "scene"):
+            name = row.get("name") if isinstance(row, dict) else None
+            if isinstance(name, str):
+                scenes[name] = partial(_open_nuscenes, path, folder, name, asked.camera)
+    return scenes
 
 
 def _loader(

@@ -125,9 +125,8 @@ def _times_of_frames(path: Path, frames: VideoFrames, fps: float) -> FloatArray:
     even, times_s = uniform_stamps(len(frames), fps), frames.times_s()
     rates = [frames.fps] if frames.fps else []
     if rates and times_s is not None and len(times_s) > 1:
-        rates.append(
-            1.0 / float(np.median(np.diff(times_s)))
-        )  # missing frames lower the mean rate alone
+        # missing frames lower the mean rate alone
+        rates.append(1.0 / float(np.median(np.diff(times_s))))
     if rates and all(abs(rate / fps - 1) > _RATE_TOLERANCE for rate in rates):
         text = (
             "%s has %.4g frames a second, the camera has %g: taken as even at the camera's rate; correct fps, unless "

@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.numbering import NumberedFiles
-from slam.formats.trajectory import BadRows, in_seconds, number_or_nan, rows_of
+from slam.formats.rows import BadRows, in_seconds, number_or_nan, rows_of
 from slam.frames import Frame, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, is_se3
 from slam.runtime.errors import SequenceError, SlamError, sequence_errors
 from slam.sequences.camera_file import Undistortion, require_size, undistorted
+from slam.sequences.gps_track import FASTEST_M_S
 from slam.sequences.images import ImageFiles, ImageSource, ReadImages, too_long
-from slam.sequences.poses import FASTEST_M_S, known_poses, rebased
+from slam.sequences.poses import known_poses, rebased
 
 logger = logging.getLogger(__name__)
 
@@ -267,9 +268,8 @@ def read_stamps(path: Path, files: NumberedFiles) -> FloatArray:
     has_header = files.rows_of(len(rows)) is None and files.rows_of(len(rows) - 1) is not None
     rows = rows[has_header:]
     first, second = (np.array([row[k] if k < len(row) else np.nan for row in rows]) for k in (0, 1))
-    is_numbered = (
-        np.isfinite(second).any() and not (np.abs(np.diff(first) - 1) > 0).any()
-    )  # NaN is a name
+    # NaN is a name
+    is_numbered = np.isfinite(second).any() and not (np.abs(np.diff(first) - 1) > 0).any()
     return require_stamps(second if is_numbered else first, path, files)
 
 
@@ -305,10 +305,8 @@ def _mended_stamps(stamps: FloatArray, path: Path) -> FloatArray:
     if len(order) == 1:
         bad.say(0, wanted)
     rows, times = np.sort(rows[order]), times[order]
-    beyond, period = (
-        len(stamps),
-        float(np.median(np.diff(times) / np.diff(rows))),
-    )  # at both ends the rate goes on
+    # at both ends the rate goes on
+    beyond, period = (len(stamps), float(np.median(np.diff(times) / np.diff(rows))))
     times = np.r_[times[0] - beyond * period, times, times[-1] + beyond * period]
     known = np.r_[rows[0] - beyond, rows, rows[-1] + beyond]
     return np.asarray(np.interp(np.arange(1, len(stamps) + 1), known, times))

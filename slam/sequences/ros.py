@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator
 from contextlib import closing
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ import numpy as np
 
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.images import first_usual, stretch_of
-from slam.formats.trajectory import BadRows, nearest_pairs
+from slam.formats.rows import BadRows
+from slam.formats.trajectory import nearest_pairs
 from slam.frames import Image
 from slam.geometry.se3 import FloatArray, invert
 from slam.runtime.errors import SequenceError
@@ -45,6 +47,9 @@ _SKIPPED_FRAMES = 30
 _SCAN_DELAY_S = 0.05
 _NANOSECONDS = 10**9
 
+Mounts = dict[str, tuple[str, FloatArray]]
+"""Parent and ``T_parent_child`` ``(4, 4)`` of each frame of ``/tf_static``; the last that is said counts."""
+
 
 class StampedMessages:
     """The messages of a topic whose first field is a header, in the order of their stamps, read one at a time.
@@ -55,16 +60,16 @@ class StampedMessages:
 
     def __init__(self, bag: Bag, topic: str) -> None:
         self._bag, self.topic = bag, topic
-        pairs = [(time_ns, bag.stamp_ns(data)) for time_ns, data in bag.raw(topic)]
-        if not pairs:
+        self._times_ns = []
+        stamps_ns = []
+        for time_ns, data in bag.raw(topic):
+            self._times_ns.append(time_ns)
+            stamps_ns.append(bag.stamp_ns(data))
+        if not stamps_ns:
             raise SequenceError(f"topic {topic} of {bag.path} has no messages")
-        self._times_ns = [time_ns for time_ns, _ in pairs]
-        stamps_ns = (
-            [stamp_ns for _, stamp_ns in pairs]
-            if any(stamp for _, stamp in pairs)
-            else self._times_ns
-        )
-        numbers = sorted(range(len(pairs)), key=lambda number: stamps_ns[number])
+        if not any(stamps_ns):
+            stamps_ns = self._times_ns
+        numbers = sorted(range(len(stamps_ns)), key=stamps_ns.__getitem__)
         if max(abs(number - place) for place, number in enumerate(numbers)) > _MOST_OUT_OF_PLACE:
             steps = np.diff(stamps_ns)
             logger.warning(
@@ -73,14 +78,15 @@ class StampedMessages:
                 -steps.min() / _NANOSECONDS,
                 int(steps.argmin()) + 1,
             )
-            stamps_ns, numbers = self._times_ns, list(range(len(pairs)))
-        self._numbers = [
-            n for k, n in enumerate(numbers) if not k or stamps_ns[n] > stamps_ns[numbers[k - 1]]
-        ]
-        if len(self._numbers) < len(pairs):
-            logger.warning(
-                "%s: %d messages repeat a stamp: left out", topic, len(pairs) - len(self._numbers)
-            )
+            stamps_ns = self._times_ns
+            numbers = list(range(len(stamps_ns)))
+        self._numbers = numbers[:1]
+        for before, number in pairwise(numbers):
+            if stamps_ns[number] > stamps_ns[before]:
+                self._numbers.append(number)
+        repeated = len(numbers) - len(self._numbers)
+        if repeated:
+            logger.warning("%s: %d messages repeat a stamp: left out", topic, repeated)
         self.stamps: FloatArray = np.array(
             [stamps_ns[number] / _NANOSECONDS for number in self._numbers]
         )
@@ -134,10 +140,6 @@ def images_of(messages: StampedMessages, where: str) -> ReadImages:
     return ReadImages(width, height, len(rows), read)
 
 
-Mounts = dict[str, tuple[str, FloatArray]]
-"""Parent and ``T_parent_child`` ``(4, 4)`` of each frame of ``/tf_static``; the last that is said counts."""
-
-
 def transform_between(mounts: Mounts, a: str, b: str) -> FloatArray | None:
     """``T_a_b`` ``(4, 4)`` of two frames; None where no static transforms join them, or where one has no name."""
     names = [frame.removeprefix("/") for frame in (a, b)]  # ROS 1 may write a slash
@@ -163,10 +165,11 @@ def moving_frames(bag: Bag) -> dict[tuple[str, str], tuple[FloatArray, FloatArra
     found: dict[tuple[str, str], dict[float, FloatArray]] = {}
     for parent, child, stamp, T_parent_child in transforms(bag, _MOVING_TOPIC):
         found.setdefault((parent, child), {}).setdefault(stamp, T_parent_child)
-    return {
-        frames: (np.array(sorted(poses)), np.stack([poses[stamp] for stamp in sorted(poses)]))
-        for frames, poses in found.items()
-    }
+    moving = {}
+    for frames, poses in found.items():
+        stamps = sorted(poses)
+        moving[frames] = np.array(stamps), np.stack([poses[stamp] for stamp in stamps])
+    return moving
 
 
 def transforms(bag: Bag, topic: str) -> Iterator[tuple[str, str, float, FloatArray]]:
@@ -181,9 +184,8 @@ def transforms(bag: Bag, topic: str) -> Iterator[tuple[str, str, float, FloatArr
                     "%s: the transform of %r is left out: %s", topic, each.child_frame_id, error
                 )
                 continue
-            parent, child = (
-                name.removeprefix("/") for name in (each.header.frame_id, each.child_frame_id)
-            )
+            parent = each.header.frame_id.removeprefix("/")
+            child = each.child_frame_id.removeprefix("/")
             yield parent, child, stamp.sec + 1e-9 * stamp.nanosec, T_parent_child
 
 
@@ -209,7 +211,9 @@ def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> Recorde
     camera = find_camera_file(
         asked, path.absolute().parent, wanted_by=str(path), images=stored, own=calibration
     )
-    mounts: Mounts = {child: (parent, T) for parent, child, _, T in transforms(bag, _STATIC_TOPIC)}
+    mounts: Mounts = {}
+    for parent, child, _, T_parent_child in transforms(bag, _STATIC_TOPIC):
+        mounts[child] = parent, T_parent_child
     frame = bag.first(topic).header.frame_id
     truth, sources = _true_poses(bag, mounts, frame, stamps), (Source(f"bag/{name}"),)
     extrinsics, scans = _scans(bag, mounts, frame, stamps)
@@ -332,12 +336,12 @@ def _find(path: Path, asked: Asked) -> dict[str, Opener]:
     """The cameras of a bag by topic; those of a folder of bags by bag, and by topic where a bag has several."""
     if not is_bag(path):
         paths = sorted(filter(is_bag, path.iterdir())) if path.is_dir() else []
-        found = {bag: _cameras(bag, asked) for bag in paths}
-        return {
-            f"{bag.stem}{topic}" if len(cameras) > 1 else bag.stem: opener
-            for bag, cameras in found.items()
-            for topic, opener in cameras.items()
-        }
+        found: dict[str, Opener] = {}
+        for bag in paths:
+            cameras = _cameras(bag, asked)
+            for topic, opener in cameras.items():
+                found[f"{bag.stem}{topic}" if len(cameras) > 1 else bag.stem] = opener
+        return found
     cameras = _cameras(path, asked)
     if not cameras:
         with closing(Bag(path)) as bag:

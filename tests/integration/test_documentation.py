@@ -88,7 +88,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"^erfsfm-slam download ", "it downloads; tests/slam/commands/downloads has a server"),
     (
         r"^erfsfm-slam calibrate ",
-        "it wants images of a board; tests/slam/commands/calibration renders them",
+        "it wants images of a board; tests/slam/commands/test_calibration.py renders them",
     ),
     (
         r"--truth many-views",
@@ -116,7 +116,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"^erfsfm-slam batch ", "it starts a cluster; tests/slam/commands/batch does"),
     (
         r"--dataset walk ",
-        "it wants a walk of 311 frames; tests/slam/pipeline/test_positioning.py has known distances",
+        "it wants a walk of 311 frames; tests/slam/pipeline/test_run.py has known distances",
     ),
     (
         r"clear640|other640|kitti05",

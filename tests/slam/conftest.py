@@ -1,9 +1,7 @@
-"""Fixtures of the system's tests: a run folder of a drive around a block, as ``erfsfm-slam run`` writes it, a few
-frames of the simulated street on disk, and untrained networks."""
+"""Fixtures of the system's tests: a run folder of a drive around a block, as ``erfsfm-slam run`` writes it."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,9 +14,6 @@ from slam.formats.trajectory import Trajectory
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector
 from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics
-from slam.simulation.kitti_layout import write_kitti_root
-from slam.simulation.options import SimulationOptions
-from slam.simulation.street import SimulatedStreet
 
 MakeRun = Callable[..., RunFolder]
 
@@ -200,58 +195,3 @@ def make_run(tmp_path: Path) -> MakeRun:
 def make_metrics() -> Callable[..., dict[str, Any]]:
     """``metrics_of``: a realistic ``metrics.json``."""
     return metrics_of
-
-
-@pytest.fixture(scope="session")
-def kitti_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A KITTI odometry root with the one sequence ``sim``: 14 frames of simulated world 1001. Not to be changed."""
-    root = tmp_path_factory.mktemp("kitti") / "root"
-    options = SimulationOptions(route="straight", frames=14, seed=1001, width=208, height=64)
-    write_kitti_root(SimulatedStreet(options), root)
-    return root
-
-
-@pytest.fixture
-def copy_of_kitti_root(kitti_root: Path, tmp_path: Path) -> Callable[[], Path]:
-    """Copies ``kitti_root`` to a place where a test may damage it."""
-    return lambda: shutil.copytree(kitti_root, tmp_path / "damaged")
-
-
-@pytest.fixture(scope="session")
-def write_weights() -> Callable[..., Path]:
-    """Writes small networks with random weights, as a training run would."""
-
-    def write(
-        folder: Path, trained_on: tuple[str, ...] = ("simulated/17",), sources: int = 4
-    ) -> Path:
-        import torch
-
-        from erfsfm.checkpoint import Model, build_networks, save_model
-        from erfsfm.config import NetworkConfig
-        from erfsfm.model_record import ModelRecord
-
-        torch.manual_seed(0)
-        network = NetworkConfig(
-            depth_width=0.1, pose_width=0.125, height=64, width=208, sources=sources
-        )
-        record = ModelRecord(
-            network=network, trained_on=list(trained_on), licence="none, untrained"
-        )
-        save_model(folder, Model(record, build_networks(network)))
-        return folder
-
-    return write
-
-
-@pytest.fixture(scope="session")
-def tiny_weights(
-    tmp_path_factory: pytest.TempPathFactory, write_weights: Callable[..., Path]
-) -> Path:
-    """Small untrained networks."""
-    return write_weights(tmp_path_factory.mktemp("weights"))
-
-
-@pytest.fixture
-def leaky_weights(tmp_path: Path, write_weights: Callable[..., Path]) -> Path:
-    """The same, recorded as trained on the world of ``kitti_root``."""
-    return write_weights(tmp_path / "leaky", ("simulated/1000-1100",))

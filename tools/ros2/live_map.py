@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.commands.export import OBSTACLE_FROM_M, OBSTACLE_TO_M, Grid, ground_along
 from slam.geometry.se3 import FloatArray, apply
+from slam.mapping.occupancy import OBSTACLE_FROM_M, OBSTACLE_TO_M, Grid, ground_along
 from slam.mapping.submap import has_moved
 
 USUAL_CAMERA_HEIGHT_M = 1.65

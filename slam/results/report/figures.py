@@ -26,14 +26,8 @@ from slam.runtime.errors import RunError
 from slam.runtime.files import MAP_MESH, REFERENCE
 from slam.runtime.imports import import_open3d
 
-COLOURS = (
-    "#0072b2",
-    "#d55e00",
-    "#009e73",
-    "#cc79a7",
-    "#e69f00",
-    "#56b4e9",
-)  # Okabe and Ito (2008): for every eye
+# Okabe and Ito (2008): for every eye
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 LOOKS: dict[
     str, tuple[str, str | None, float, str]
 ] = {  # label, colour (None: that of text), width, dash

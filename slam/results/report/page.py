@@ -23,10 +23,11 @@ from slam.formats.trajectory import Trajectory
 from slam.frames import Image, Intrinsics
 from slam.loops.verification import Loop
 from slam.mapping.depth import KeyframeDepth
-from slam.results import tables
 from slam.results.folder import RunFolder
 from slam.results.metrics import METRES, AcceptedLoop, LoopsFile, Metrics
-from slam.results.tables import alignments_table, errors_table, missing_errors, verdict
+from slam.results.report import tables
+from slam.results.tables import alignments_table, errors_table, missing_errors
+from slam.results.verdict import verdict
 from slam.runtime.errors import SlamError
 from slam.runtime.files import LOOPS, REFERENCE, REPORT, TRAJECTORIES
 from slam.runtime.record import NOT_RECORDED
@@ -119,74 +120,72 @@ def _plots(
     from slam.results.report import figures
 
     found: dict[str, list[Picture]] = {"trajectories": [], "errors": [], "map": []}
-
-    def add(
-        section: str, title: str, caption: str, draw: Callable[..., Figure], *given: Any
-    ) -> None:
-        try:
-            figure = draw(*given).update_layout(
-                template={}
-            )  # page.js draws it in the colours of the page
-            plot = str(figure.to_json()).replace("<", "\\u003c")
-            found[section].append(Picture(title, caption, plot=plot))
-        except SlamError as error:
-            found[section].append(Picture(title, caption, reason=str(error)))
-
     has_truth = REFERENCE in trajectories and len(trajectories) > 1
-    unit = "m" if metrics.unit == METRES else metrics.unit
-    gaps = metrics.sequence.bridged or []
     if trajectories:
-        given = (trajectories, "m" if has_truth else unit, loops)
-        caption = _ALIGNED if has_truth else _AS_WRITTEN
-        add("trajectories", "Trajectories from above", caption, figures.trajectories_figure, *given)
+        found["trajectories"] = _trajectory_plots(metrics, trajectories, loops, has_truth)
     if has_truth:
-        how = (
-            "as written, the network after the 7-dof alignment"
-            if metrics.is_metric
-            else "after the 7-dof alignment"
-        )
-        caption = f"Lengths of stretches of 1/25 of the path, {how}; rotation after it. Interpolated frames are shaded."
-        title = "Scale and rotation over time"
-        add(
-            "trajectories",
-            title,
-            caption,
-            figures.scale_figure,
-            trajectories,
-            metrics.is_metric,
-            gaps,
-        )
-        caption = "Distance to the true position, after the 7-dof alignment."
-        add("errors", "Position error along the path", caption, figures.error_figure, trajectories)
-        if metrics.trajectories.optimised.align.dof7.t_rel_percent is not None:
-            caption = "Mean relative error of all segments of a length; the scale is that of the 7-dof alignment."
-            add(
-                "errors",
-                "Drift by the length of segments",
-                caption,
-                figures.drift_figure,
-                trajectories,
-            )
-    elif trajectories:
-        caption = (
-            "Speed, and the angles of the optimised trajectory. Interpolated frames are shaded."
-        )
-        add(
-            "trajectories",
-            "Speed and rotation over time",
-            caption,
-            figures.motion_figure,
-            trajectories,
-            unit,
-            gaps,
-        )
+        found["errors"] = _error_plots(metrics, trajectories)
     if view is not None:
         caption = (
             f"The map, thinned, and the camera's path, seen first from its place at frame {view.frame}. "
             "Drag to turn it, with the right button to move it; the wheel zooms."
         )
-        add("map", "Map", caption, figures.map_figure, view)
+        found["map"] = [_plot("Map", caption, figures.map_figure, view)]
     return found
+
+
+def _trajectory_plots(
+    metrics: Metrics,
+    trajectories: Mapping[str, Trajectory],
+    loops: Sequence[AcceptedLoop],
+    has_truth: bool,
+) -> list[Picture]:
+    """The paths from above, and over time their scale and rotation, or without a truth their speed."""
+    from slam.results.report import figures
+
+    unit = "m" if metrics.unit == METRES or has_truth else metrics.unit
+    caption = _ALIGNED if has_truth else _AS_WRITTEN
+    draw = figures.trajectories_figure
+    above = _plot("Trajectories from above", caption, draw, trajectories, unit, loops)
+    gaps = metrics.sequence.bridged or []
+    if not has_truth:
+        title = "Speed and rotation over time"
+        caption = (
+            "Speed, and the angles of the optimised trajectory. Interpolated frames are shaded."
+        )
+        return [above, _plot(title, caption, figures.motion_figure, trajectories, unit, gaps)]
+    title = "Scale and rotation over time"
+    how = (
+        "as written, the network after the 7-dof alignment"
+        if metrics.is_metric
+        else "after the 7-dof alignment"
+    )
+    caption = f"Lengths of stretches of 1/25 of the path, {how}; rotation after it. Interpolated frames are shaded."
+    is_metric = metrics.is_metric
+    return [above, _plot(title, caption, figures.scale_figure, trajectories, is_metric, gaps)]
+
+
+def _error_plots(metrics: Metrics, trajectories: Mapping[str, Trajectory]) -> list[Picture]:
+    """Errors along the path and, where there are long segments, by their lengths."""
+    from slam.results.report import figures
+
+    caption = "Distance to the true position, after the 7-dof alignment."
+    title = "Position error along the path"
+    found = [_plot(title, caption, figures.error_figure, trajectories)]
+    if metrics.trajectories.optimised.align.dof7.t_rel_percent is not None:
+        caption = "Mean relative error of all segments of a length; the scale is that of the 7-dof alignment."
+        title = "Drift by the length of segments"
+        found.append(_plot(title, caption, figures.drift_figure, trajectories))
+    return found
+
+
+def _plot(title: str, caption: str, draw: Callable[..., Figure], *given: Any) -> Picture:
+    """What ``draw`` makes of what is given, or the reason why it cannot."""
+    try:
+        figure = draw(*given).update_layout(template={})  # page.js draws it in the page's colours
+    except SlamError as error:
+        return Picture(title, caption, reason=str(error))
+    return Picture(title, caption, plot=str(figure.to_json()).replace("<", "\\u003c"))
 
 
 @cache

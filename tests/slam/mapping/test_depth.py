@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from erfsfm.mvs.fusion import DepthFusion
+from slam.config.sections import MappingConfig
 from slam.frames import Intrinsics
-from slam.mapping.depth import DepthRefiner
+from slam.mapping.depth import DepthFilters, DepthRefiner, KeyframeDepth
 
 CAMERA = Intrinsics(64, 32, 50.0, 50.0, 31.5, 15.5)
 DEPTH = np.full((32, 64), 10.0, np.float32)
@@ -49,3 +50,19 @@ def test_what_is_unknown_begins_with_its_neighbours_and_is_not_believed_unmeasur
     unmeasured = ~(np.isfinite(holes) & (holes > 0)) & ~refined.measured
     assert unmeasured.any() and np.isinf(refined.relative_sigma[unmeasured]).all()
     assert np.isfinite(refined.relative_sigma[~unmeasured]).all()
+
+
+def test_how_far_depth_is_fused_depends_on_its_sigma(monkeypatch):
+    camera = Intrinsics(100, 50, 80.0, 80.0, 49.5, 24.5)
+    depth = np.repeat(np.linspace(15, 40, 100, dtype=np.float32)[None], 50, axis=0)
+    monkeypatch.setattr("slam.mapping.depth._MAX_DEPTH_STEP", 10.0)
+    config = MappingConfig(depth_max_m=20)
+    image = np.full((50, 100, 3), 90, np.uint8)
+
+    def farthest(relative_sigma: np.ndarray | None) -> float:
+        view = KeyframeDepth(0, depth, relative_sigma, image, np.eye(4))
+        return float(DepthFilters(config, camera).kept(view, ()).max())
+
+    assert 19 < farthest(None) < 20 and 19 < farthest(np.full_like(depth, 0.1)) < 20
+    assert 23 < farthest(np.full_like(depth, 0.05)) <= 24  # 0.05 of 24 m is 1.2 m
+    assert 27 < farthest(np.full_like(depth, 0.02)) < 28

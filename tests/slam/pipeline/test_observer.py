@@ -24,7 +24,7 @@ from slam.pipeline.estimate import Estimate
 from slam.pipeline.observer import Observer
 from slam.pipeline.run import SlamPipeline, read_frame
 from slam.runtime.errors import Failed, MissingFrameError, SequenceError
-from slam.runtime.resources import Stopwatch
+from slam.runtime.stopwatch import Stopwatch
 from slam.sequences.catalogue import SimulatedSequence
 from slam.simulation.options import SimulationOptions
 

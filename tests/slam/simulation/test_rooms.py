@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from slam.geometry import se3
-from slam.results.estimate_metrics import find_truth
+from slam.results.truth_errors import find_truth
 from slam.sequences.catalogue import SimulatedSequence, open_sequence
 from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions

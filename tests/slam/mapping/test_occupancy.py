@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-
-import cv2
 import numpy as np
 import pytest
-import yaml
 from meshes import coloured_ply
 
-from slam.commands.cli import app
-from slam.commands.export import FREE, OCCUPIED, UNKNOWN, export, ground_along, occupancy_grid
 from slam.formats.ply import Ply
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
-from slam.results.folder import RunFolder
-from slam.results.metrics import ScaleMetrics
+from slam.mapping.occupancy import FREE, OCCUPIED, UNKNOWN, ground_along, occupancy_grid
 from slam.runtime.errors import RunError
 
 CAMERA_HEIGHT = 1.65
@@ -157,37 +149,3 @@ def test_large_triangles_leave_no_holes(street: tuple[Ply, FloatArray]) -> None:
     assert (
         values[-(rows + 150) : -rows] == FREE
     ).mean() > 0.985  # the border cells are cut by the edge
-
-
-@pytest.mark.parametrize("name", ["map.yaml", "map.pgm"])
-def test_the_grid_of_a_run(
-    make_recorded: Callable[..., RunFolder], tmp_path: Path, name: str
-) -> None:
-    written = export(make_recorded(), "occupancy", tmp_path / "new" / name, "z", resolution=0.2)
-    assert sorted(path.name for path in written.parent.iterdir()) == ["map.pgm", "map.yaml"]
-    described = yaml.safe_load(written.read_text())
-    as_map_server = {"occupied_thresh": 0.65, "free_thresh": 0.196, "negate": 0}
-    place = {"image": "map.pgm", "resolution": 0.2, "origin": [0.0, 2.0, 0.0]}
-    assert written.name == "map.yaml" and described == place | as_map_server
-    cells = cv2.imread(str(written.with_name(described["image"])), cv2.IMREAD_UNCHANGED)
-    assert cells.shape == (15, 10) and (cells == FREE).mean() > 0.9
-
-
-def test_a_grid_without_metres_says_so(
-    make_recorded: Callable[..., RunFolder], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder, output = make_recorded(), tmp_path / "map.yaml"
-    words = ["export", str(folder.path), "--what", "occupancy", "--output", str(output)]
-    for unit, note in (("camera heights", True), ("metres", False)):
-        folder.write_metrics(
-            folder.metrics().changed(scale=ScaleMetrics(mode="none", value=9.8, unit=unit))
-        )
-        app(words, standalone_mode=False)
-        assert ("not in metres" in capsys.readouterr().out) == note
-        assert output.read_text().startswith(f"# lengths in {unit}\n") and yaml.safe_load(
-            output.read_text()
-        )
-    own = ScaleMetrics(mode="none", unit="the networks' own unit")
-    folder.write_metrics(folder.metrics().changed(scale=own))
-    with pytest.raises(RunError, match="need metres or camera heights"):
-        export(folder, "occupancy", output)

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from slam.commands.evaluation import compare
-from slam.commands.live import FolderSource, StreamedSequence
 from slam.formats.trajectory import read_trajectory
 from slam.runtime.errors import SlamError
 from slam.sequences.camera_file import explicit_camera
 from slam.sequences.catalogue import open_sequence
+from slam.sequences.stream import FolderSource, StreamedSequence
 
 # what was tried, the advice in its message, and what is tried when one follows it
 Case = tuple[Callable[[], Any], str, Callable[[re.Match[str]], Any]]

@@ -1,77 +1,16 @@
-"""Time and memory of a run; arrays spilled to a temporary file, which limits the memory of a long drive."""
+"""Arrays spilled to a temporary file, which limits the memory of a long drive."""
 
 from __future__ import annotations
 
-import ctypes
-import resource
-import sys
 import tempfile
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from threading import Lock
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.runtime.errors import SlamError
-
-T = TypeVar("T")
-
-
-class Stopwatch:
-    """Wall-clock seconds by stage, processor seconds and peak memory of the whole process."""
-
-    def __init__(self) -> None:
-        self._start = time.perf_counter()
-        self._cpu_start = time.process_time()
-        self.stages: dict[str, float] = {}
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Add the time of the block to a stage; a stage may be entered many times.
-
-        Stages are measured in the main thread, so that they add up: work in another thread counts as long as the
-        main thread waits for it.
-        """
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.stages[name] = self.stages.get(name, 0.0) + time.perf_counter() - start
-
-    def each(self, name: str, items: Iterator[T]) -> Iterator[T]:
-        """The items; the time to wait for each belongs to a stage."""
-        while True:
-            with self.stage(name):
-                item = next(items, None)
-            if item is None:
-                return
-            yield item
-
-    @property
-    def seconds(self) -> float:
-        """Wall-clock seconds since the start."""
-        return time.perf_counter() - self._start
-
-    @property
-    def cpu_seconds(self) -> float:
-        """Processor seconds, user and system, since the start."""
-        return time.process_time() - self._cpu_start
-
-
-def peak_rss_mb() -> float:
-    """Largest resident memory of this process so far, MiB."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
-
-
-def return_freed_memory() -> None:
-    """Give memory back that glibc's heaps keep: of images and layers of many sizes about 120 kB a frame."""
-    if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "malloc_trim"):
-        libc.malloc_trim(0)
 
 
 class SpillFile:

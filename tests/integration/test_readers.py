@@ -283,7 +283,7 @@ def samples(tmp_path_factory: pytest.TempPathFactory, kitti_root: Path, tiny_wei
     (place / "split.yaml").write_text(
         "train: [kitti_raw/a]\nvalidation: []\ntest: ['kitti_raw/b[0:10]']\n"
     )
-    shutil.copy(Path(__file__).parents[3] / "configs/erfsfm/tiny.yaml", place / "training.yaml")
+    shutil.copy(Path(__file__).parents[2] / "configs/erfsfm/tiny.yaml", place / "training.yaml")
     triangle = np.eye(3)
     write_ply(place / "mesh.ply", coloured_ply(triangle, triangle, triangle, np.array([[0, 1, 2]])))
     _write_old_checkpoint(place / "old.pth.tar")

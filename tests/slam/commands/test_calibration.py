@@ -18,9 +18,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from erfsfm.common.readers.camera_file import CameraFile, read_camera_file
-from slam.commands.calibration import Board
 from slam.commands.cli import main
 from slam.frames import Intrinsics
+from slam.sequences.board import Board
 from slam.sequences.catalogue import open_sequence
 
 Call = Callable[..., tuple[int, str, str]]

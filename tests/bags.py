@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -130,14 +129,3 @@ class BagWriter:
     def close(self) -> Path:
         self.writer.close()
         return self.path
-
-
-@pytest.fixture(params=["ros1", "mcap", pytest.param("sqlite", marks=pytest.mark.slow)])
-def kind(request: pytest.FixtureRequest) -> str:
-    value: str = request.param
-    return value
-
-
-@pytest.fixture
-def new_bag(tmp_path: Path) -> Callable[..., BagWriter]:
-    return lambda kind="mcap", name="walk": BagWriter(tmp_path / name, kind)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 import struct
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,7 +14,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from bags import BagWriter
 
+from erfsfm.common.readers.camera_file import CameraFile, Pinhole, read_camera_file
 from slam.commands.doctor import examine
 from slam.frames import Intrinsics
 from slam.runtime import imports
@@ -22,6 +26,17 @@ from slam.sequences.catalogue import open_sequence, sequence_kinds
 CAMERA = Intrinsics(40, 24, 30, 30, 20, 12)
 FIRST_NS, STEP_NS, FRAMES = 1403715273262142976, 50_000_000, 6
 NewBag = Callable[..., Any]
+CHANNELS = {
+    "rgb8": 3,
+    "bgra8": 4,
+    "8UC3": 3,
+    "yuv422": 2,
+    "yuv422_yuy2": 2,
+    "mono16": 1,
+    "16UC1": 1,
+}
+COMPARED_FRAMES, COMPARED_STEP_NS = 8, 100_000_000
+BENT = (-0.02, 0.001, 0.0, 0.0)
 
 
 def picture(k: int, channels: int = 1) -> np.ndarray:
@@ -74,17 +89,6 @@ def test_compressed_images(new_bag: NewBag, kind: str, suffix: str) -> None:
     bag.write("/camera/image_raw/compressed", FIRST_NS, message)
     expected = cv2.imdecode(data, cv2.IMREAD_COLOR)[:, :, ::-1]
     assert np.array_equal(open_sequence(bag.close()).frame(0).image, expected)
-
-
-CHANNELS = {
-    "rgb8": 3,
-    "bgra8": 4,
-    "8UC3": 3,
-    "yuv422": 2,
-    "yuv422_yuy2": 2,
-    "mono16": 1,
-    "16UC1": 1,
-}
 
 
 @pytest.mark.parametrize(("encoding", "channels"), CHANNELS.items())
@@ -352,3 +356,80 @@ def test_without_rosbags_the_extra_is_named(
     monkeypatch.setattr(imports.importlib, "import_module", absent)
     with pytest.raises(SlamError, match=r"bags need rosbags .*erfsfm-slam\[ros\]"):
         open_sequence(tmp_path / "walk.bag")
+
+
+def write_plain(folder: Path, files: list[Path], stamps: list[int], camera: CameraFile) -> Path:
+    folder.mkdir()
+    for path in files:
+        shutil.copy(path, folder)
+    (folder / "times.txt").write_text("".join(f"{s // 10**9}.{s % 10**9:09d}\n" for s in stamps))
+    (folder / "camera.yaml").write_text(json.dumps(camera.model_dump(exclude_none=True)))
+    return folder
+
+
+def write_euroc(folder: Path, files: list[Path], stamps: list[int], camera: CameraFile) -> Path:
+    data = folder / "mav0/cam0/data"
+    data.mkdir(parents=True)
+    for path, stamp in zip(files, stamps, strict=True):
+        shutil.copy(path, data / f"{stamp}.png")
+    (data.parent / "data.csv").write_text(
+        "#timestamp,filename\n" + "".join(f"{s},{s}.png\n" for s in stamps)
+    )
+    sensor = {
+        "T_BS": {"data": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]},
+        "rate_hz": 10,
+        "resolution": [camera.width, camera.height],
+        "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+        "distortion_model": "radtan",
+        "distortion_coefficients": list(BENT),
+    }
+    (data.parent / "sensor.yaml").write_text("%YAML:1.0\n" + json.dumps(sensor))
+    return folder
+
+
+def write_bag(bag: Any, files: list[Path], stamps: list[int], camera: CameraFile) -> Path:
+    bag.camera_info("/camera/camera_info", camera.pinhole, "plumb_bob", BENT)
+    for path, stamp in zip(files, stamps, strict=True):
+        bag.image("/camera/image_raw", stamp, cv2.imread(str(path)), "bgr8", late_ns=3_000_000)
+    made: Path = bag.close()
+    return made
+
+
+def test_the_same_frames_are_the_same_sequence(
+    tmp_path: Path, kitti_root: Path, new_bag: Callable[..., Any]
+) -> None:
+    files = sorted((kitti_root / "sequences/sim/image_2").iterdir())[:COMPARED_FRAMES]
+    stamps = [FIRST_NS + k * COMPARED_STEP_NS for k in range(COMPARED_FRAMES)]
+    simulated = open_sequence(kitti_root).intrinsics
+    known = read_camera_file(kitti_root / "camera.yaml").model_dump() | vars(Pinhole.of(simulated))
+    camera = CameraFile.model_validate(
+        known | {"model": "opencv", "distortion": BENT, "camera_height_m": "unknown"}
+    )
+    plain, *others = map(
+        open_sequence,
+        (
+            write_plain(tmp_path / "plain", files, stamps, camera),
+            write_euroc(tmp_path / "euroc", files, stamps, camera),
+            write_bag(new_bag("ros1", "one"), files, stamps, camera),
+            write_bag(new_bag("sqlite", "two"), files, stamps, camera),
+        ),
+    )
+    assert plain.intrinsics.undistorted and plain.stamps[0] == pytest.approx(
+        FIRST_NS / 1e9, abs=1e-6
+    )
+    for other in others:
+        assert other.intrinsics == plain.intrinsics and other.camera_height_m is None
+        np.testing.assert_array_equal(other.stamps, plain.stamps)
+        for k in range(COMPARED_FRAMES):
+            np.testing.assert_array_equal(other.frame(k).image, plain.frame(k).image)
+
+
+@pytest.fixture(params=["ros1", "mcap", pytest.param("sqlite", marks=pytest.mark.slow)])
+def kind(request: pytest.FixtureRequest) -> str:
+    value: str = request.param
+    return value
+
+
+@pytest.fixture
+def new_bag(tmp_path: Path) -> Callable[..., BagWriter]:
+    return lambda kind="mcap", name="walk": BagWriter(tmp_path / name, kind)

@@ -1,55 +1,30 @@
-"""Which front end measures a drive, its poses by keyframes and bundle adjustment, and the maps of keyframes closed.
-
-They are closed after the last frame: loops among all keyframes, maps joined, everything adjusted once.
-"""
+"""Maps of keyframes closed after the last frame: loops among all keyframes, maps joined, all adjusted once."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import islice
-from typing import Literal
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from erfsfm.common.processes import opencv_threads, usable_cores
-from slam.config.sections import KeyframesConfig, LoopsConfig
-from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent, View
-from slam.frontend.drive import LAST_STEPS, Drive
+from slam.frames import Intrinsics, TrackingEvent, View
 from slam.frontend.factors import scaled_poses
-from slam.frontend.keyframes.learned_units import learned_unit
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
-from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
-from slam.frontend.keyframes.submaps import join, parts_of
+from slam.frontend.keyframes.submaps import join
 from slam.frontend.scale import Scale
 from slam.geometry.se3 import FloatArray, invert, make, path_distance
 from slam.graph.pose_graph import RelativeSimilarity, optimise_similarities
 from slam.loops.closure import LoopClosures, Track, find_loops, most_inliers_first
 from slam.loops.verification import OF_KEYFRAMES, Loop, LoopVerifier
-from slam.runtime.errors import Failed
 
 logger = logging.getLogger(__name__)
-FrontEnd = Literal["steps", "both", "keyframes"]
 
-# looked back for the frame before, and keyframes that give the unit
-_FRAMES, _KEYFRAMES = 40, 20
-_CLEAR_STEPS, _MOST_STEPS = (
-    10,
-    30,
-)  # triangulated steps after which auto decides, if it is clear, or however that is
-_VEHICLE_SCATTER_DEG = 10.0  # median angle of a vehicle's steps to their usual direction, degrees
-_CLEAR_SCATTER_DEG = (
-    5.0  # of a camera that is carried: a vehicle's first steps scatter by 2 degrees
-)
-_VEHICLE_SPEED = (
-    1.5  # camera heights a second: a car at 9 km/h; a robot, a drone and a walker have less
-)
 # keyframes that share so many tracks are in one place already
 _CONNECTED = 10
 _NEIGHBOURS = 3
@@ -60,142 +35,6 @@ _ROTATION_SIGMA, _RELATIVE_SIGMA, _SCALE_SIGMA = 0.005, 0.03, 0.02
 _LEAST_SIGMA = 1e-4
 _LOOP_SCALE_SIGMA = 0.05  # of the logarithm of the ratio of two units by a loop
 _TURN_SIGMAS = 3.0  # of a motion between parts of a map, by which a loop may correct it
-
-
-def choose(config: KeyframesConfig, camera_height_m: float | None, drive: Drive) -> FrontEnd:
-    """What measures a drive: both, until its first steps show whether the camera is on a vehicle.
-
-    A known camera height says that there is a road. Lengths from the road do not enter the map of keyframes yet, and on
-    roads they matter more than its longer baselines.
-    """
-    if config.use == "always":
-        return "keyframes"
-    if config.use == "never" or camera_height_m is not None:
-        return "steps"
-    is_on_vehicle = _is_on_vehicle(drive)
-    if is_on_vehicle is None:
-        return "both"
-    return "steps" if is_on_vehicle else "keyframes"
-
-
-class KeyframeTracking:
-    """Tracks keyframes, for as long as steps alone are not chosen."""
-
-    def __init__(
-        self,
-        config: KeyframesConfig,
-        loops: LoopsConfig,
-        intrinsics: Intrinsics,
-        seed: int,
-        camera_height_m: float | None = None,
-        on_keyframe: Callable[[Frame], None] = lambda frame: None,
-    ) -> None:
-        """Prepare for the first frame; ``on_keyframe`` is told of a keyframe before it is adjusted."""
-        self._config, self._intrinsics, self._camera_height_m = config, intrinsics, camera_height_m
-        self._front_end: FrontEnd = "both"
-        self._cores = ExitStack()
-        # the networks, which predict little for keyframes, leave their core to optical flow
-        self._cores.enter_context(opencv_threads(usable_cores()))
-        self._odometry: KeyframeOdometry | None = KeyframeOdometry(
-            intrinsics, seed, on_keyframe, loops.enabled
-        )
-        self.choose(Drive())
-
-    @property
-    def _measuring(self) -> KeyframeOdometry | None:
-        """The keyframes where they measure the drive: not before the choice, nor on a vehicle."""
-        return self._odometry if self._front_end == "keyframes" else None
-
-    @property
-    def events(self) -> Sequence[TrackingEvent]:
-        """What became of the maps so far."""
-        return () if self._odometry is None else self._odometry.events
-
-    def follow(self, frame: Frame) -> None:
-        """Track the next usable frame."""
-        if self._odometry is not None:
-            self._odometry.follow(frame)
-
-    def learn(self, frame: Frame, depth: DepthMap) -> None:
-        """Learned depth ``(H, W)`` of the frame that was followed last."""
-        if self._odometry is not None:
-            self._odometry.learn(frame, depth)
-
-    def choose(self, drive: Drive) -> None:
-        """Choose what measures the frames that follow, until that is one of both."""
-        if self._front_end == "both":
-            self._front_end = choose(self._config, self._camera_height_m, drive)
-        if self._front_end == "steps":
-            self._odometry = None
-            self.close()
-
-    def close(self) -> None:
-        """Give the cores back that optical flow had."""
-        self._cores.close()
-
-    def measures(self, drive: Drive, index: int) -> bool:
-        """Whether keyframes alone measure the motion to one of the last frames.
-
-        A step measures it by a gap or a lost camera, and before the choice.
-        """
-        if self._measuring is None:
-            return False
-        is_usable = {index - 1, index}.isdisjoint(list(drive.unusable)[-LAST_STEPS:])
-        return (
-            is_usable
-            and drive.last_step(index) is None
-            and self._measuring.locates(index - 1, index)
-        )
-
-    def step(self, index: int) -> tuple[int, FloatArray] | None:
-        """The last located frame before this one, and ``T_before_frame`` unscaled; None where it has no pose."""
-        if self._measuring is None or not self._measuring.segments:
-            return None
-        segment = self._measuring.segments[-1]
-        placed = [
-            (f.index, f.T_camera_world) for f in segment.frames[-_FRAMES:] if f.index <= index
-        ]
-        located = [(place, T_map) for place, T_map in placed if T_map is not None]
-        if len(located) < 2 or located[-1][0] != index:
-            return None
-        (before, T_before_map), (_, T_frame_map) = located[-2:]
-        T_before_frame = T_before_map @ invert(T_frame_map)
-        T_before_frame[:3, 3] *= learned_unit(
-            LocalMap(segment.keyframes[-_KEYFRAMES:], segment.points)
-        )
-        return before, T_before_frame
-
-    def maps(self, drive: Drive) -> list[LocalMap]:
-        """All parts of maps so far, each in one unit; none of a vehicle, nor before the choice."""
-        self.choose(drive)
-        if self._measuring is None:
-            return []
-        maps = [each.copy() for each in self._measuring.segments if each.started]
-        return [part for each in maps for part in parts_of(each, self._intrinsics)]
-
-
-def _is_on_vehicle(drive: Drive) -> bool | None:
-    """Whether the first triangulated steps all go the same way, as seen from the camera, at the speed of a vehicle.
-
-    None while they are few. Without a road nothing has the speed of a vehicle; a vehicle that starts is slow.
-    """
-    first = list(
-        islice((motion for motion in drive.motions if motion.is_triangulated), _MOST_STEPS)
-    )
-    if len(first) < _CLEAR_STEPS:
-        return None
-    heights = [road for road in drive.roads if not isinstance(road, Failed)]
-    speeds = [motion.length_unscaled / motion.seconds for motion in first]
-    is_fast = bool(heights) and bool(np.median(speeds) >= _VEHICLE_SPEED * np.median(heights))
-    steps = np.array([motion.relative_pose.T_from_to[:3, 3] for motion in first])
-    directions = steps / np.linalg.norm(steps, axis=1, keepdims=True)
-    usual = np.median(directions, axis=0)
-    cosine = directions @ usual / max(float(np.linalg.norm(usual)), 1e-9)
-    scatter_deg = float(np.rad2deg(np.arccos(np.clip(np.median(cosine), -1.0, 1.0))))
-    is_clear = is_fast or scatter_deg > _CLEAR_SCATTER_DEG
-    if len(first) < _MOST_STEPS and not is_clear:
-        return None
-    return is_fast and scatter_deg < _VEHICLE_SCATTER_DEG
 
 
 @dataclass(frozen=True)
@@ -256,9 +95,9 @@ class _Rows:
 
     def __init__(self, maps: Sequence[LocalMap], poses: KeyframePoses) -> None:
         self.segments = maps
-        self.keyframes: list[TrackedKeyframe] = [
-            keyframe for segment in maps for keyframe in segment.keyframes
-        ]
+        self.keyframes: list[TrackedKeyframe] = []
+        for segment in maps:
+            self.keyframes += segment.keyframes
         counts = [len(segment.keyframes) for segment in maps]
         self.maps: NDArray[np.intp] = np.repeat(np.arange(len(maps)), counts)
         self.T_map_camera = np.concatenate([segment.T_world_camera for segment in maps])
@@ -283,6 +122,10 @@ class _Rows:
         earlier, later = self.track.rows([loop])[0].tolist()
         return earlier, later
 
+    def _maps_of(self, loop: Loop) -> set[int]:
+        """Numbers of the maps of its keyframes, of which there may be one."""
+        return set(self.maps[list(self.of(loop))].tolist())
+
     def views(self) -> list[View]:
         """Corners with their points in the camera where these have parallax: others would give a loop a wrong scale."""
         views = []
@@ -306,16 +149,10 @@ class _Rows:
         """Each map after the first that loops join with an earlier one."""
         events = []
         for number, segment in enumerate(self.segments):
-            rows = [
-                (earlier, later)
-                for earlier, later in map(self.of, loops)
-                if self.maps[earlier] != number
-            ]
-            joining = [
-                self.keyframes[earlier].index
-                for earlier, later in rows
-                if self.maps[later] == number
-            ]
+            joining = []
+            for earlier, later in map(self.of, loops):
+                if self.maps[earlier] != number and self.maps[later] == number:
+                    joining.append(self.keyframes[earlier].index)
             if joining:
                 first = segment.keyframes[0].index
                 events.append(TrackingEvent(first, "map joined", joining[0], len(joining)))
@@ -327,14 +164,10 @@ class _Rows:
         """Poses ``(K, 4, 4)`` and units ``(K,)`` of all keyframes in the world of the first of some joined maps."""
         T, scales = self.T_map_camera.copy(), np.ones(len(self.keyframes))
         done = {int(members[0])}
-        across = [loop for loop in loops if len(set(self.maps[list(self.of(loop))])) == 2]
+        across = [loop for loop in loops if len(self._maps_of(loop)) == 2]
         across.sort(key=lambda loop: -loop.inliers)
         while len(done) < len(members):
-            loop = next(
-                loop
-                for loop in across
-                if len(done & set(self.maps[list(self.of(loop))].tolist())) == 1
-            )
+            loop = next(loop for loop in across if len(done & self._maps_of(loop)) == 1)
             known, new = self.of(loop)
             T_known_new, scale = loop.measured.T_from_to, loop.scale
             if int(self.maps[known]) not in done:
@@ -361,15 +194,15 @@ def _closed(
     closed, wrong = [], []
     for number in np.unique(group):
         members = np.flatnonzero(group == number)
-        inside = [
-            loop for loop, (earlier, _) in zip(loops, ends, strict=True) if group[earlier] == number
-        ]
+        inside = list(compress(loops, group[ends[:, 0]] == number))
         if not inside:
             closed += [rows.segments[member] for member in members]
             continue
         joined, kept = _joined(rows, inside, members, intrinsics)
         closed.append(joined)
-        wrong += [loop for loop, ratio in zip(inside, kept, strict=True) if ratio < _LEAST_KEPT]
+        for loop, ratio in zip(inside, kept, strict=True):
+            if ratio < _LEAST_KEPT:
+                wrong.append(loop)
     return closed, wrong
 
 
@@ -381,9 +214,8 @@ def _joined(
     place = np.full(len(rows.keyframes), -1)
     place[chosen] = np.arange(len(chosen))
     edges, shared = [], []
-    for first, row in enumerate(
-        chosen
-    ):  # between neighbouring keyframes of one map, whose unit hardly changes
+    # between neighbouring keyframes of one map, whose unit hardly changes
+    for first, row in enumerate(chosen):
         for last in range(first + 1, min(first + 1 + _NEIGHBOURS, len(chosen))):
             if rows.maps[row] == rows.maps[chosen[last]]:
                 T_step = invert(rows.T_map_camera[row]) @ rows.T_map_camera[chosen[last]]

@@ -95,7 +95,13 @@ class SurfaceTruth:
 
 
 def thinned(points: FloatArray, voxel_m: float, order: Indices) -> Indices:
-    """Of the points ``(P, 3)`` in each voxel the one that comes first in an order ``(P,)``: their indices."""
+    """Of the points ``(P, 3)`` in each voxel the one that comes first in an order ``(P,)``: their indices.
+
+    Args:
+        points: ``(P, 3)``, metres.
+        voxel_m: the side of a voxel.
+        order: rows of all points ``(P,)``, the preferred ones first.
+    """
     key = np.zeros(len(points), dtype=np.int64)
     for axis in points.T:  # one at a time, for there are millions
         key = (key << _KEY_BITS) | (
@@ -205,6 +211,11 @@ def pose_similarity(
 
     Least squares of positions and of points 10 m from every camera: positions alone do not determine the roll about a
     straight road, which the map depends on.
+
+    Args:
+        T_world_camera_true: true poses ``(N, 4, 4)``.
+        T_world_camera: estimated ones ``(N, 4, 4)``, row k beside row k.
+        with_scale: whether a scale is fitted, or 1.
     """
     R_true, R_estimate = T_world_camera_true[:, :3, :3], T_world_camera[:, :3, :3]
     true, estimate = T_world_camera_true[:, :3, 3], T_world_camera[:, :3, 3]

@@ -118,6 +118,12 @@ def relative_errors(
     """Translation (metres) and rotation (radians) errors ``(M,)`` of the motions between pairs of rows.
 
     E = (T_est,i^-1 T_est,j)^-1 (T_ref,i^-1 T_ref,j)      (Geiger et al. 2012, Eqs. 2-3)
+
+    Args:
+        T_world_estimate: poses ``(N, 4, 4)``.
+        T_world_reference: the true ones ``(N, 4, 4)``, row k beside row k.
+        starts: rows where the motions begin ``(M,)``.
+        ends: rows where they end ``(M,)``.
     """
     T_start_end_estimate = se3.invert(T_world_estimate[starts]) @ T_world_estimate[ends]
     T_start_end_reference = se3.invert(T_world_reference[starts]) @ T_world_reference[ends]
@@ -278,6 +284,11 @@ def align(
     ``none`` as written; ``first`` both rebased to their first pose; ``scale`` then also one factor,
     s = sum(g . p) / sum(p . p); ``6dof`` and ``7dof`` the best rigid motion and the best similarity of the
     positions. The scale of an estimate that stands still is undefined; it is left as it is.
+
+    Args:
+        T_world_estimate: poses ``(N, 4, 4)``.
+        T_world_reference: the true ones ``(N, 4, 4)``, row k beside row k.
+        alignment: how.
     """
     if alignment in ("first", "scale"):
         T_world_reference = se3.invert(T_world_reference[0]) @ T_world_reference
@@ -302,6 +313,14 @@ def evo_commands(estimate: Path | str, reference: Path | str, format: str = "aut
     """The evo commands that give the numbers of ``evo`` for two files.
 
     None for files of two formats, with bad rows, or with stamps so different that poses are interpolated.
+
+    Args:
+        estimate: a file.
+        reference: a file.
+        format: of both, as `read_trajectory` takes it.
+
+    Raises:
+        TrajectoryError: a file cannot be read, or the two do not match.
     """
     a, b = read_trajectory(estimate, format), read_trajectory(reference, format)
     if a.timed != b.timed or a.rows or b.rows:
@@ -325,6 +344,9 @@ def exceeded(metrics: TrajectoryMetrics, limits: Sequence[str]) -> list[str]:
         metrics: the object T.
         limits: ``METRIC=VALUE`` each; METRIC is a path as ``align.7dof.ate_rmse_m`` or ``snippet5.ate_mean``,
             and a bare name such as ``ate_rmse_m`` means the one under ``7dof``.
+
+    Raises:
+        ConfigError: a limit is not METRIC=VALUE, or there is no such metric.
     """
     lines, names = [], AlignedMetrics.names()
     for limit in limits:

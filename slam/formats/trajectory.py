@@ -193,6 +193,11 @@ def associate(
 
     Of ``frames`` only these rows [start, stop) of the reference count; an estimate of as many rows is of these frames.
 
+    Args:
+        estimate: the trajectory to evaluate.
+        reference: the truth.
+        frames: rows [start, stop) of the reference that count; None for all.
+
     Raises:
         TrajectoryError: if the lengths differ and stamps or frame numbers are missing, or none match.
     """
@@ -294,7 +299,13 @@ def _period_s(trajectory: Trajectory) -> float:
 def nearest_pairs(
     a: FloatArray, b: FloatArray, within_s: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows of two increasing series of stamps that are each other's nearest and at most ``within_s`` apart."""
+    """Rows of two increasing series of stamps that are each other's nearest and at most ``within_s`` apart.
+
+    Args:
+        a: stamps ``(N,)``, increasing.
+        b: stamps ``(M,)``, increasing.
+        within_s: the most that two of a pair are apart.
+    """
     nearest_b, nearest_a = nearest_stamps(a, b), nearest_stamps(b, a)
     rows_a = np.arange(len(a))
     chosen = (nearest_a[nearest_b] == rows_a) & (np.abs(b[nearest_b] - a) <= within_s)

@@ -283,7 +283,14 @@ class ViewChooser:
 def has_moved(
     T_world_camera: FloatArray, T_world_before: FloatArray, step_m: float, turn_deg: float
 ) -> bool:
-    """Whether a camera has moved by a step or a turn."""
+    """Whether a camera has moved by a step or a turn.
+
+    Args:
+        T_world_camera: its pose now ``(4, 4)``.
+        T_world_before: its pose before ``(4, 4)``.
+        step_m: the least length of a step.
+        turn_deg: the least angle of a turn.
+    """
     T_before_camera = invert(T_world_before) @ T_world_camera
     turned = float(rotation_angle(T_before_camera[:3, :3]))
     return float(np.linalg.norm(T_before_camera[:3, 3])) >= step_m or turned >= np.deg2rad(turn_deg)

@@ -38,6 +38,11 @@ def choose(config: KeyframesConfig, camera_height_m: float | None, drive: Drive)
 
     A known camera height says that there is a road. Lengths from the road do not enter the map of keyframes yet, and on
     roads they matter more than its longer baselines.
+
+    Args:
+        config: the settings of keyframes.
+        camera_height_m: above the road, metres; None where unknown.
+        drive: the measurements so far.
     """
     if config.use == "always":
         return "keyframes"
@@ -61,7 +66,17 @@ class KeyframeTracking:
         camera_height_m: float | None = None,
         on_keyframe: Callable[[Frame], None] = lambda frame: None,
     ) -> None:
-        """Prepare for the first frame; ``on_keyframe`` is told of a keyframe before it is adjusted."""
+        """Prepare for the first frame.
+
+        Args:
+            config: the settings of keyframes.
+            loops: those of loops; where these are enabled, the camera is sought again after it was
+                lost.
+            intrinsics: of all images.
+            seed: of all RANSAC draws.
+            camera_height_m: above the road, metres; None where unknown.
+            on_keyframe: is told of a keyframe before it is adjusted.
+        """
         self._config, self._intrinsics, self._camera_height_m = config, intrinsics, camera_height_m
         self._front_end: FrontEnd = "both"
         self._cores = ExitStack()

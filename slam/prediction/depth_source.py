@@ -63,7 +63,15 @@ class DepthSource(Protocol):
     sha256: str
 
     def disparity(self, frame: Frame) -> Disparity:
-        """1/depth ``(h, w)`` of any size, NaN where unknown."""
+        """1/depth ``(h, w)`` of any size, NaN where unknown.
+
+        Args:
+            frame: its image is ``(H, W, 3)``; a source of files reads its index alone.
+
+        Raises:
+            SlamError: the file of this frame is missing or was changed, or the network fails on its
+                image.
+        """
 
 
 class SourcedPredictor:

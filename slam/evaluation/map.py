@@ -121,10 +121,11 @@ def stretches(T_world_camera: FloatArray, truth_frames: Indices) -> list[Indices
     positions = T_world_camera[:, :3, 3]
     away, _ = cKDTree(positions[truth_frames]).query(positions)
     number = (path_distance(T_world_camera) / STRETCH_M).astype(np.int64)
-    parts = [
-        np.flatnonzero((number == k) & (away <= _NEAR_TRUTH_M)) for k in range(int(number[-1]) + 1)
-    ]
-    parts = [part for part in parts if len(part)]
+    parts: list[Indices] = []
+    for k in range(int(number[-1]) + 1):
+        part = np.flatnonzero((number == k) & (away <= _NEAR_TRUTH_M))
+        if len(part):
+            parts.append(part)
     if len(parts) <= MOST_STRETCHES:
         return parts
     chosen = ((np.arange(MOST_STRETCHES) + 0.5) * len(parts) / MOST_STRETCHES).astype(np.intp)

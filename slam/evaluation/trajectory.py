@@ -256,9 +256,8 @@ def trajectory_metrics(
     ours = {
         name: _alignment_metrics(T_world_estimate, T_world_reference, name) for name in ALIGNMENTS
     }
-    predicted, true = (
-        snippets_from_trajectory(T, SNIPPET_LENGTH) for T in (T_world_estimate, T_world_reference)
-    )
+    predicted = snippets_from_trajectory(T_world_estimate, SNIPPET_LENGTH)
+    true = snippets_from_trajectory(T_world_reference, SNIPPET_LENGTH)
     without_ate = None
     if _stands_still(T_world_reference):
         without_ate = _REFERENCE_STANDS_STILL
@@ -325,9 +324,8 @@ def evo_commands(estimate: Path | str, reference: Path | str, format: str = "aut
     a, b = read_trajectory(estimate, format), read_trajectory(reference, format)
     if a.timed != b.timed or a.rows or b.rows:
         return []
-    if not all(
-        np.isin(ours.stamps, whole.stamps).all() for ours, whole in zip(associate(a, b), (a, b))
-    ):
+    of_a, of_b = associate(a, b)
+    if not (np.isin(of_a.stamps, a.stamps).all() and np.isin(of_b.stamps, b.stamps).all()):
         return []
     files = f"{'tum' if a.timed else 'kitti'} {shlex.quote(str(reference))} {shlex.quote(str(estimate))}"
     options = "--align --correct_scale"
@@ -350,7 +348,8 @@ def exceeded(metrics: TrajectoryMetrics, limits: Sequence[str]) -> list[str]:
     """
     lines, names = [], AlignedMetrics.names()
     for limit in limits:
-        name, _, text = (part.strip() for part in limit.partition("="))
+        name, _, text = limit.partition("=")
+        name = name.strip()
         try:
             most = float(text)
         except ValueError:
@@ -433,10 +432,8 @@ def _evo_metrics(
     from evo.core.metrics import APE, RPE, PoseRelation, StatisticsType, Unit
     from evo.core.trajectory import PosePath3D
 
-    estimate, reference = (
-        PosePath3D(poses_se3=[*T_world_estimate]),
-        PosePath3D(poses_se3=[*T_world_reference]),
-    )
+    estimate = PosePath3D(poses_se3=[*T_world_estimate])
+    reference = PosePath3D(poses_se3=[*T_world_reference])
     values = {}
     try:
         estimate.align(reference, correct_scale=True)

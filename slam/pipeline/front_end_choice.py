@@ -138,10 +138,10 @@ class KeyframeTracking:
         if self._measuring is None or not self._measuring.segments:
             return None
         segment = self._measuring.segments[-1]
-        placed = [
-            (f.index, f.T_camera_world) for f in segment.frames[-_FRAMES:] if f.index <= index
-        ]
-        located = [(place, T_map) for place, T_map in placed if T_map is not None]
+        located: list[tuple[int, FloatArray]] = []
+        for each in segment.frames[-_FRAMES:]:
+            if each.index <= index and each.T_camera_world is not None:
+                located.append((each.index, each.T_camera_world))
         if len(located) < 2 or located[-1][0] != index:
             return None
         (before, T_before_map), (_, T_frame_map) = located[-2:]
@@ -157,7 +157,10 @@ class KeyframeTracking:
         if self._measuring is None:
             return []
         maps = [each.copy() for each in self._measuring.segments if each.started]
-        return [part for each in maps for part in parts_of(each, self._intrinsics)]
+        parts: list[LocalMap] = []
+        for each in maps:
+            parts += parts_of(each, self._intrinsics)
+        return parts
 
 
 def _is_on_vehicle(drive: Drive) -> bool | None:

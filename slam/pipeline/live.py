@@ -94,16 +94,12 @@ class LivePoses:
             self._solve(observer, count)
         unit = None if self.unit_name is None else self._unit
         support = frame_support(frames, drive.motions[-LAST_STEPS * len(frames) :]).tolist()
-        return [
-            LivePose(
-                k,
-                pose.copy(),
-                self._state(k in drive.unusable),
-                unit,
-                None if k in unasked else share,
-            )
-            for k, pose, share in zip(frames, self._T_world_camera[first:], support)
-        ]
+        poses: list[LivePose] = []
+        for index, pose, share in zip(frames, self._T_world_camera[first:], support):
+            state = self._state(index in drive.unusable)
+            support_of = None if index in unasked else share
+            poses.append(LivePose(index, pose.copy(), state, unit, support_of))
+        return poses
 
     def correct(self, T_world_camera: FloatArray, scale: Scale) -> None:
         """Go on from the poses ``(N, 4, 4)`` and the unit of a whole drive."""

@@ -288,11 +288,9 @@ def camera_file_of(
         raise SequenceError(
             f"{where} has no calibration, its focal length is {fx:g}: give --camera"
         )
-    width, height, roi = (
-        info.width or (size or (0, 0))[0],
-        info.height or (size or (0, 0))[1],
-        info.roi,
-    )
+    width = info.width or (size or (0, 0))[0]
+    height = info.height or (size or (0, 0))[1]
+    roi = info.roi
     if size != (width, height):
         binning_x, binning_y = max(info.binning_x, 1), max(info.binning_y, 1)
         if roi.width and roi.height:
@@ -330,10 +328,8 @@ def points_of(cloud: Any, where: str) -> FloatArray:
     data: NDArray[np.uint8] = np.asarray(cloud.data, dtype=np.uint8)
     if len(data) < count * step:
         raise DataError(f"{where} has {len(data)} bytes for {count} points of {step}")
-    formats, places = (
-        [f"{'>' if cloud.is_bigendian else '<'}f4"] * 3,
-        [offsets[axis] for axis in "xyz"],
-    )
+    formats = [f"{'>' if cloud.is_bigendian else '<'}f4"] * 3
+    places = [offsets[axis] for axis in "xyz"]
     layout = np.dtype(
         {"names": list("xyz"), "formats": formats, "offsets": places, "itemsize": step}
     )

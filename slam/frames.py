@@ -116,13 +116,33 @@ class Sequence(Protocol):
         """Number of frames."""
 
     def frame(self, index: int) -> Frame:
-        """Read one frame; ``SequenceError`` where its image cannot be read."""
+        """Read one frame.
+
+        Args:
+            index: of the frame, from 0.
+
+        Raises:
+            MissingFrameError: its number is missing from the files, a gap in time; a
+                `SequenceError`.
+            SequenceError: there is no such frame, or its image cannot be read.
+        """
 
     def has_scan(self, index: int) -> bool:
-        """Whether a LiDAR scan was taken with a frame."""
+        """Whether a LiDAR scan was taken with a frame.
+
+        Args:
+            index: of the frame, from 0.
+        """
 
     def scan(self, index: int) -> FloatArray:
-        """The points ``(P, 3)`` of a frame's scan, metres, in the LiDAR; ``SequenceError`` where unreadable."""
+        """The points ``(P, 3)`` of a frame's scan, metres, in the LiDAR.
+
+        Args:
+            index: of a frame that has a scan.
+
+        Raises:
+            SequenceError: the frame has no scan, or it cannot be read.
+        """
 
     def provenance(self) -> tuple[str, ...]:
         """Names of the recordings, as in the leak record of a checkpoint."""
@@ -153,10 +173,25 @@ class Predictor(Protocol):
     sources: int
 
     def depth(self, frame: Frame) -> DepthMap:
-        """Unscaled z-depth ``(H, W)`` of a frame, at the image's size: positive and finite, or NaN where unknown."""
+        """Unscaled z-depth ``(H, W)`` of a frame, at the image's size: positive and finite, or NaN where unknown.
+
+        Args:
+            frame: its image is ``(H, W, 3)``.
+
+        Raises:
+            SlamError: depth from elsewhere has no file for this frame, or its network fails.
+        """
 
     def snippet(self, frames: list[Frame]) -> SnippetPoses:
-        """Poses of the sources of a snippet whose target is the middle frame."""
+        """Poses of the sources of a snippet whose target is the middle frame.
+
+        Args:
+            frames: of one snippet in time order, as many as ``sources`` and the target.
+
+        Raises:
+            SlamError: depth from elsewhere is known in none of the frames, where poses take their
+                unit from it.
+        """
 
     def executor(self) -> Executor:
         """A new executor of one thread for this predictor, with its number of cores; the user shuts it down."""

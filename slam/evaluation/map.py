@@ -95,7 +95,13 @@ class SurfaceTruth:
 
 
 def thinned(points: FloatArray, voxel_m: float, order: Indices) -> Indices:
-    """Of the points ``(P, 3)`` in each voxel the one that comes first in an order ``(P,)``: their indices."""
+    """Of the points ``(P, 3)`` in each voxel the one that comes first in an order ``(P,)``: their indices.
+
+    Args:
+        points: ``(P, 3)``, metres.
+        voxel_m: the side of a voxel.
+        order: rows of all points ``(P,)``, the preferred ones first.
+    """
     key = np.zeros(len(points), dtype=np.int64)
     for axis in points.T:  # one at a time, for there are millions
         key = (key << _KEY_BITS) | (
@@ -115,10 +121,11 @@ def stretches(T_world_camera: FloatArray, truth_frames: Indices) -> list[Indices
     positions = T_world_camera[:, :3, 3]
     away, _ = cKDTree(positions[truth_frames]).query(positions)
     number = (path_distance(T_world_camera) / STRETCH_M).astype(np.int64)
-    parts = [
-        np.flatnonzero((number == k) & (away <= _NEAR_TRUTH_M)) for k in range(int(number[-1]) + 1)
-    ]
-    parts = [part for part in parts if len(part)]
+    parts: list[Indices] = []
+    for k in range(int(number[-1]) + 1):
+        part = np.flatnonzero((number == k) & (away <= _NEAR_TRUTH_M))
+        if len(part):
+            parts.append(part)
     if len(parts) <= MOST_STRETCHES:
         return parts
     chosen = ((np.arange(MOST_STRETCHES) + 0.5) * len(parts) / MOST_STRETCHES).astype(np.intp)
@@ -205,6 +212,11 @@ def pose_similarity(
 
     Least squares of positions and of points 10 m from every camera: positions alone do not determine the roll about a
     straight road, which the map depends on.
+
+    Args:
+        T_world_camera_true: true poses ``(N, 4, 4)``.
+        T_world_camera: estimated ones ``(N, 4, 4)``, row k beside row k.
+        with_scale: whether a scale is fitted, or 1.
     """
     R_true, R_estimate = T_world_camera_true[:, :3, :3], T_world_camera[:, :3, :3]
     true, estimate = T_world_camera_true[:, :3, 3], T_world_camera[:, :3, 3]

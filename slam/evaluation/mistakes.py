@@ -71,7 +71,8 @@ def likely_mistakes(
         pair: the rows of both that belong together (`slam.formats.trajectory.associate`).
     """
     every = max(len(pair[0]) // _MOST_POSES, 1)
-    T_estimate, T_reference = (each.T_world_camera[::every] for each in pair)
+    T_estimate = pair[0].T_world_camera[::every]
+    T_reference = pair[1].T_world_camera[::every]
     extent = float(np.std(T_reference[:, :3, 3], axis=0).max())
     if len(T_reference) < _LEAST_POSES or not extent > 0:
         return []

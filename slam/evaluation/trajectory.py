@@ -118,6 +118,12 @@ def relative_errors(
     """Translation (metres) and rotation (radians) errors ``(M,)`` of the motions between pairs of rows.
 
     E = (T_est,i^-1 T_est,j)^-1 (T_ref,i^-1 T_ref,j)      (Geiger et al. 2012, Eqs. 2-3)
+
+    Args:
+        T_world_estimate: poses ``(N, 4, 4)``.
+        T_world_reference: the true ones ``(N, 4, 4)``, row k beside row k.
+        starts: rows where the motions begin ``(M,)``.
+        ends: rows where they end ``(M,)``.
     """
     T_start_end_estimate = se3.invert(T_world_estimate[starts]) @ T_world_estimate[ends]
     T_start_end_reference = se3.invert(T_world_reference[starts]) @ T_world_reference[ends]
@@ -250,9 +256,8 @@ def trajectory_metrics(
     ours = {
         name: _alignment_metrics(T_world_estimate, T_world_reference, name) for name in ALIGNMENTS
     }
-    predicted, true = (
-        snippets_from_trajectory(T, SNIPPET_LENGTH) for T in (T_world_estimate, T_world_reference)
-    )
+    predicted = snippets_from_trajectory(T_world_estimate, SNIPPET_LENGTH)
+    true = snippets_from_trajectory(T_world_reference, SNIPPET_LENGTH)
     without_ate = None
     if _stands_still(T_world_reference):
         without_ate = _REFERENCE_STANDS_STILL
@@ -278,6 +283,11 @@ def align(
     ``none`` as written; ``first`` both rebased to their first pose; ``scale`` then also one factor,
     s = sum(g . p) / sum(p . p); ``6dof`` and ``7dof`` the best rigid motion and the best similarity of the
     positions. The scale of an estimate that stands still is undefined; it is left as it is.
+
+    Args:
+        T_world_estimate: poses ``(N, 4, 4)``.
+        T_world_reference: the true ones ``(N, 4, 4)``, row k beside row k.
+        alignment: how.
     """
     if alignment in ("first", "scale"):
         T_world_reference = se3.invert(T_world_reference[0]) @ T_world_reference
@@ -302,13 +312,20 @@ def evo_commands(estimate: Path | str, reference: Path | str, format: str = "aut
     """The evo commands that give the numbers of ``evo`` for two files.
 
     None for files of two formats, with bad rows, or with stamps so different that poses are interpolated.
+
+    Args:
+        estimate: a file.
+        reference: a file.
+        format: of both, as `read_trajectory` takes it.
+
+    Raises:
+        TrajectoryError: a file cannot be read, or the two do not match.
     """
     a, b = read_trajectory(estimate, format), read_trajectory(reference, format)
     if a.timed != b.timed or a.rows or b.rows:
         return []
-    if not all(
-        np.isin(ours.stamps, whole.stamps).all() for ours, whole in zip(associate(a, b), (a, b))
-    ):
+    of_a, of_b = associate(a, b)
+    if not (np.isin(of_a.stamps, a.stamps).all() and np.isin(of_b.stamps, b.stamps).all()):
         return []
     files = f"{'tum' if a.timed else 'kitti'} {shlex.quote(str(reference))} {shlex.quote(str(estimate))}"
     options = "--align --correct_scale"
@@ -325,10 +342,14 @@ def exceeded(metrics: TrajectoryMetrics, limits: Sequence[str]) -> list[str]:
         metrics: the object T.
         limits: ``METRIC=VALUE`` each; METRIC is a path as ``align.7dof.ate_rmse_m`` or ``snippet5.ate_mean``,
             and a bare name such as ``ate_rmse_m`` means the one under ``7dof``.
+
+    Raises:
+        ConfigError: a limit is not METRIC=VALUE, or there is no such metric.
     """
     lines, names = [], AlignedMetrics.names()
     for limit in limits:
-        name, _, text = (part.strip() for part in limit.partition("="))
+        name, _, text = limit.partition("=")
+        name = name.strip()
         try:
             most = float(text)
         except ValueError:
@@ -411,10 +432,8 @@ def _evo_metrics(
     from evo.core.metrics import APE, RPE, PoseRelation, StatisticsType, Unit
     from evo.core.trajectory import PosePath3D
 
-    estimate, reference = (
-        PosePath3D(poses_se3=[*T_world_estimate]),
-        PosePath3D(poses_se3=[*T_world_reference]),
-    )
+    estimate = PosePath3D(poses_se3=[*T_world_estimate])
+    reference = PosePath3D(poses_se3=[*T_world_reference])
     values = {}
     try:
         estimate.align(reference, correct_scale=True)

@@ -62,6 +62,15 @@ class BadRows:
 
         A row a few places late is sorted in, and so are all rows of a table in no order at all. Bad rows are said. A
         file of which more than a quarter would be left out is refused, and so is one without a ``wanted`` row (`say`).
+
+        Args:
+            stamps: of the rows ``(N,)``.
+            what: the stamps are called, for messages.
+            lines: on which the rows are ``(N,)``.
+            wanted: a good row, for messages.
+
+        Raises:
+            SlamError: of the kind of this table: the order is ambiguous, or no row is left.
         """
         order = np.argsort(stamps, kind="stable")
         has_no_order = len(order) > 1 and np.mean(np.diff(stamps) < 0) > 1 - _LEAST_IN_ORDER
@@ -90,7 +99,15 @@ class BadRows:
         return good
 
     def say(self, left: int, wanted: str) -> None:
-        """Warn of the rows left out; refuse the file where none of those ``wanted`` is ``left``."""
+        """Warn of the rows left out; refuse the file where none of those ``wanted`` is ``left``.
+
+        Args:
+            left: number of good rows.
+            wanted: a good row, for messages.
+
+        Raises:
+            SlamError: of the kind of this table: no row is left.
+        """
         line, reason = min(self._reasons.items(), default=(0, ""))
         if not left:
             where = f", line {line}: {reason}" if reason else ": there is no row in this file"
@@ -108,7 +125,16 @@ class BadRows:
 
 
 def text_of(path: Path, error: type[SlamError], wanted: str) -> str:
-    """The text of a file that should hold what is ``wanted``; the ``error`` where it cannot be read."""
+    """The text of a file that should hold what is ``wanted``.
+
+    Args:
+        path: of the file.
+        error: the kind of error that is raised.
+        wanted: what it should hold, for the message.
+
+    Raises:
+        SlamError: of the given kind: there is no such file, or it is no text.
+    """
     try:
         return read_text(path)
     except FileNotFoundError as cause:
@@ -119,7 +145,16 @@ def text_of(path: Path, error: type[SlamError], wanted: str) -> str:
 
 
 def rows_of(path: Path, error: type[SlamError], wanted: str) -> list[tuple[int, str]]:
-    """Line numbers and texts of the rows of a table, without blank lines and comments; as `text_of`."""
+    """Line numbers and texts of the rows of a table, without blank lines and comments.
+
+    Args:
+        path: of the file.
+        error: the kind of error that is raised.
+        wanted: what it should hold, for the message.
+
+    Raises:
+        SlamError: of the given kind: as `text_of`.
+    """
     lines = enumerate(map(str.strip, text_of(path, error, wanted).splitlines()), start=1)
     return [(number, line) for number, line in lines if line and not line.startswith("#")]
 

@@ -161,19 +161,21 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
 def write_kitti(path: Path | str, trajectory: Trajectory) -> None:
     """Write the upper 3x4 of each ``T_world_camera``, row by row, atomically; after its number where it has one."""
     rows = trajectory.T_world_camera[:, :3].reshape(len(trajectory), 12)
-    numbers = [f"{stamp:.0f} " if trajectory.numbered else "" for stamp in trajectory.stamps]
-    lines = (f"{number}{_row(row)}\n" for number, row in zip(numbers, rows))
+    lines: list[str] = []
+    for stamp, row in zip(trajectory.stamps, rows):
+        number = f"{stamp:.0f} " if trajectory.numbered else ""
+        lines.append(f"{number}{_row(row)}\n")
     write_atomically(Path(path), "".join(lines), TrajectoryError)
 
 
 def write_tum(path: Path | str, trajectory: Trajectory) -> None:
     """Write ``t tx ty tz qx qy qz qw`` a row, atomically; stamps are written with all their digits."""
     poses = translations_and_quaternions(trajectory.T_world_camera)
-    stamps = (np.format_float_positional(stamp, min_digits=9) for stamp in trajectory.stamps)
-    lines = (f"{stamp} {_row(pose)}\n" for stamp, pose in zip(stamps, poses))
-    write_atomically(
-        Path(path), "".join(["# timestamp tx ty tz qx qy qz qw\n", *lines]), TrajectoryError
-    )
+    lines = ["# timestamp tx ty tz qx qy qz qw\n"]
+    for stamp, pose in zip(trajectory.stamps, poses):
+        seconds = np.format_float_positional(stamp, min_digits=9)
+        lines.append(f"{seconds} {_row(pose)}\n")
+    write_atomically(Path(path), "".join(lines), TrajectoryError)
 
 
 def translations_and_quaternions(T_a_b: FloatArray) -> FloatArray:
@@ -192,6 +194,11 @@ def associate(
     numbers where one of the two has them, and else row k belongs to row k.
 
     Of ``frames`` only these rows [start, stop) of the reference count; an estimate of as many rows is of these frames.
+
+    Args:
+        estimate: the trajectory to evaluate.
+        reference: the truth.
+        frames: rows [start, stop) of the reference that count; None for all.
 
     Raises:
         TrajectoryError: if the lengths differ and stamps or frame numbers are missing, or none match.
@@ -294,7 +301,13 @@ def _period_s(trajectory: Trajectory) -> float:
 def nearest_pairs(
     a: FloatArray, b: FloatArray, within_s: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows of two increasing series of stamps that are each other's nearest and at most ``within_s`` apart."""
+    """Rows of two increasing series of stamps that are each other's nearest and at most ``within_s`` apart.
+
+    Args:
+        a: stamps ``(N,)``, increasing.
+        b: stamps ``(M,)``, increasing.
+        within_s: the most that two of a pair are apart.
+    """
     nearest_b, nearest_a = nearest_stamps(a, b), nearest_stamps(b, a)
     rows_a = np.arange(len(a))
     chosen = (nearest_a[nearest_b] == rows_a) & (np.abs(b[nearest_b] - a) <= within_s)

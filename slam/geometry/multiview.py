@@ -254,7 +254,14 @@ class UnitRelativePose:
 def unit_pose_by_essential(
     rays_previous: FloatArray, rays_current: FloatArray, tolerance: float, seed: int = 0
 ) -> UnitRelativePose | None:
-    """The motion with most support among matched rays ``(M, 3)`` with z = 1, within ``tolerance`` on z = 1."""
+    """The motion with most support among matched rays ``(M, 3)`` with z = 1, within ``tolerance`` on z = 1.
+
+    Args:
+        rays_previous: ``(M, 3)`` with z = 1, in the previous camera.
+        rays_current: of the same points ``(M, 3)`` with z = 1, in the current one.
+        tolerance: largest error of an inlier on the plane z = 1.
+        seed: of the draws.
+    """
     order = ransac_order(len(rays_previous), seed)
     rays_previous, rays_current = rays_previous[order], rays_current[order]
     cv2.setRNGSeed(seed)
@@ -291,6 +298,12 @@ def unit_poses_by_homography(
     """The motions, at most two, by which a plane explains the matched rays ``(M, 3)`` with z = 1, within ``tolerance``.
 
     The plane must lie in front of the previous camera where its inliers see it.
+
+    Args:
+        rays_previous: ``(M, 3)`` with z = 1, in the previous camera.
+        rays_current: of the same points ``(M, 3)`` with z = 1, in the current one.
+        tolerance: largest error of an inlier on the plane z = 1.
+        seed: of the draws.
     """
     order = ransac_order(len(rays_previous), seed)
     rays_previous, rays_current = rays_previous[order], rays_current[order]
@@ -323,6 +336,13 @@ def unit_pose_by_pnp(
     """The motion with most support among the same rays where their depths ``(M,)`` are known, else NaN.
 
     Known depth separates dynamic objects from the static scene.
+
+    Args:
+        rays_previous: ``(M, 3)`` with z = 1, in the previous camera.
+        rays_current: of the same points ``(M, 3)`` with z = 1, in the current one.
+        depth_previous: z-depth ``(M,)`` in the previous camera, NaN where unknown.
+        tolerance: largest error of an inlier on the plane z = 1.
+        seed: of the draws.
     """
     known = np.isfinite(depth_previous)
     if known.sum() < _LEAST_CONSENSUS:
@@ -341,7 +361,14 @@ def parallax_px(
     R_current_previous: FloatArray,
     focal: tuple[float, float],
 ) -> FloatArray:
-    """Optical flow of each point in pixels ``(M,)`` without that of the rotation."""
+    """Optical flow of each point in pixels ``(M,)`` without that of the rotation.
+
+    Args:
+        rays_previous: ``(M, 3)`` with z = 1, in the previous camera.
+        rays_current: of the same points ``(M, 3)`` with z = 1, in the current one.
+        R_current_previous: the rotation ``(3, 3)`` between them.
+        focal: both focal lengths, pixels.
+    """
     rotated = rays_previous @ R_current_previous.T
     rotated = rotated[:, :2] / np.where(rotated[:, 2:] > 1e-6, rotated[:, 2:], 1e-6)
     difference = (rays_current[:, :2] - rotated) * focal

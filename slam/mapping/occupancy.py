@@ -81,7 +81,15 @@ class Grid:
 
     @classmethod
     def around(cls, points: FloatArray, resolution: float) -> Grid:
-        """The cells that points ``(P, 3)`` lie in; their borders are multiples of ``resolution``."""
+        """The cells that points ``(P, 3)`` lie in; their borders are multiples of ``resolution``.
+
+        Args:
+            points: ``(P, 3)``, of which x and y count.
+            resolution: the side of a cell, in the unit of the points.
+
+        Raises:
+            RunError: it would have too many cells.
+        """
         # rounded, so that an edge on a border of cells does not begin another row
         low = np.floor((points[:, :2].min(axis=0) / resolution).round(_BORDER_DECIMALS))
         high = np.ceil((points[:, :2].max(axis=0) / resolution).round(_BORDER_DECIMALS))
@@ -178,6 +186,14 @@ def ground_along(points: FloatArray, T_world_camera: FloatArray, camera_height: 
     """The ground by points of the map ``(P, 3)``, z up, under cameras ``(N, 4, 4)`` in the same axes.
 
     ``camera_height`` is a first guess, which the map then corrects.
+
+    Args:
+        points: of the map ``(P, 3)``, z up.
+        T_world_camera: poses of the cameras ``(N, 4, 4)`` in the same axes.
+        camera_height: a first guess, in the unit of the points.
+
+    Raises:
+        RunError: the map has no ground below the cameras.
     """
     chosen = moved_rows(T_world_camera, _ANCHOR_STEP * camera_height, math.inf)
     cameras, up = T_world_camera[chosen, :3, 3], -T_world_camera[chosen, :3, 1]
@@ -216,6 +232,16 @@ def write_ros_map(
     """Write a grid as `occupancy_grid` gives it: ``<name>.pgm`` and, after it, ``<name>.yaml``, each atomically.
 
     ``map_server`` takes lengths for metres, whatever their ``unit`` is: a comment says so.
+
+    Args:
+        path: of the YAML file.
+        cells: the grid ``(H, W)`` as a picture.
+        corner: smallest x and y ``(2,)``.
+        resolution: the side of a cell.
+        unit: of all lengths.
+
+    Raises:
+        RunError: a file cannot be written.
     """
     image = path.with_suffix(".pgm")
     write_atomically(image, cv2.imencode(".pgm", cells)[1].tobytes(), RunError)

@@ -154,17 +154,13 @@ class MergedSubmaps:
     def __init__(self, submaps: Sequence[SpilledSubmap]) -> None:
         """Read what stays in memory of at least one submap."""
         self._keys: list[Keys] = [submap["keys"].read().astype(np.int64) for submap in submaps]
-        poses, steps = (
-            [submap[name].read() for submap in submaps]
-            for name in ("T_world_camera", "brightness_steps")
-        )
+        poses = [submap["T_world_camera"].read() for submap in submaps]
+        steps = [submap["brightness_steps"].read() for submap in submaps]
         self.T_world_views: FloatArray = np.concatenate(poses)
         self.brightness_steps: FloatArray = np.concatenate(steps)
         self.submap_of_view = np.repeat(np.arange(len(submaps)), [len(each) for each in steps])
-        self.count, self.blocks = (
-            len(self._keys),
-            len(np.unique(np.concatenate(self._keys), axis=0)),
-        )
+        self.count = len(self._keys)
+        self.blocks = len(np.unique(np.concatenate(self._keys), axis=0))
 
         @lru_cache(maxsize=_REMEMBERED)
         def read(number: int) -> Submap:
@@ -283,7 +279,14 @@ class ViewChooser:
 def has_moved(
     T_world_camera: FloatArray, T_world_before: FloatArray, step_m: float, turn_deg: float
 ) -> bool:
-    """Whether a camera has moved by a step or a turn."""
+    """Whether a camera has moved by a step or a turn.
+
+    Args:
+        T_world_camera: its pose now ``(4, 4)``.
+        T_world_before: its pose before ``(4, 4)``.
+        step_m: the least length of a step.
+        turn_deg: the least angle of a turn.
+    """
     T_before_camera = invert(T_world_before) @ T_world_camera
     turned = float(rotation_angle(T_before_camera[:3, :3]))
     return float(np.linalg.norm(T_before_camera[:3, 3])) >= step_m or turned >= np.deg2rad(turn_deg)

@@ -121,8 +121,10 @@ class MapSurface:
             )
         everything = sum(int(piece.sizes.sum()) for piece in self._pieces)
         self.floater_share = 1 - self.triangles / everything
-        sizes = [(len(each), int((each["filled"] == 0).sum())) for each in self.vertex_pieces()]
-        self.vertices, self.points = (sum(column) for column in zip(*sizes))
+        self.vertices = self.points = 0
+        for each in self.vertex_pieces():
+            self.vertices += len(each)
+            self.points += int((each["filled"] == 0).sum())
 
     def vertex_pieces(self) -> Iterator[NDArray[np.void]]:
         """Vertices as records with position, normal, colour and ``filled``, each once, tile by tile."""

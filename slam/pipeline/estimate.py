@@ -133,9 +133,13 @@ def fitted(mapping: MappingConfig, drive: Drive, scale_per_frame: FloatArray) ->
     Where no depth is known they stay as they are.
     """
     some = np.linspace(0, len(drive.keyframes) - 1, _SOME).round().astype(int)
-    chosen = (drive.keyframes[n] for n in np.unique(some))
-    depths = (each.depth_unscaled * np.float32(scale_per_frame[each.index]) for each in chosen)
-    medians = [np.median(known) for depth in depths if (known := depth[np.isfinite(depth)]).size]
+    medians = []
+    for number in np.unique(some):
+        keyframe = drive.keyframes[number]
+        depth = keyframe.depth_unscaled * np.float32(scale_per_frame[keyframe.index])
+        known = depth[np.isfinite(depth)]
+        if known.size:
+            medians.append(np.median(known))
     return mapping.in_unit(float(np.median(medians)) / _STREET_DEPTH_M) if medians else mapping
 
 

@@ -38,6 +38,11 @@ def choose(config: KeyframesConfig, camera_height_m: float | None, drive: Drive)
 
     A known camera height says that there is a road. Lengths from the road do not enter the map of keyframes yet, and on
     roads they matter more than its longer baselines.
+
+    Args:
+        config: the settings of keyframes.
+        camera_height_m: above the road, metres; None where unknown.
+        drive: the measurements so far.
     """
     if config.use == "always":
         return "keyframes"
@@ -61,7 +66,17 @@ class KeyframeTracking:
         camera_height_m: float | None = None,
         on_keyframe: Callable[[Frame], None] = lambda frame: None,
     ) -> None:
-        """Prepare for the first frame; ``on_keyframe`` is told of a keyframe before it is adjusted."""
+        """Prepare for the first frame.
+
+        Args:
+            config: the settings of keyframes.
+            loops: those of loops; where these are enabled, the camera is sought again after it was
+                lost.
+            intrinsics: of all images.
+            seed: of all RANSAC draws.
+            camera_height_m: above the road, metres; None where unknown.
+            on_keyframe: is told of a keyframe before it is adjusted.
+        """
         self._config, self._intrinsics, self._camera_height_m = config, intrinsics, camera_height_m
         self._front_end: FrontEnd = "both"
         self._cores = ExitStack()
@@ -123,10 +138,10 @@ class KeyframeTracking:
         if self._measuring is None or not self._measuring.segments:
             return None
         segment = self._measuring.segments[-1]
-        placed = [
-            (f.index, f.T_camera_world) for f in segment.frames[-_FRAMES:] if f.index <= index
-        ]
-        located = [(place, T_map) for place, T_map in placed if T_map is not None]
+        located: list[tuple[int, FloatArray]] = []
+        for each in segment.frames[-_FRAMES:]:
+            if each.index <= index and each.T_camera_world is not None:
+                located.append((each.index, each.T_camera_world))
         if len(located) < 2 or located[-1][0] != index:
             return None
         (before, T_before_map), (_, T_frame_map) = located[-2:]
@@ -142,7 +157,10 @@ class KeyframeTracking:
         if self._measuring is None:
             return []
         maps = [each.copy() for each in self._measuring.segments if each.started]
-        return [part for each in maps for part in parts_of(each, self._intrinsics)]
+        parts: list[LocalMap] = []
+        for each in maps:
+            parts += parts_of(each, self._intrinsics)
+        return parts
 
 
 def _is_on_vehicle(drive: Drive) -> bool | None:

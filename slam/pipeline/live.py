@@ -94,16 +94,12 @@ class LivePoses:
             self._solve(observer, count)
         unit = None if self.unit_name is None else self._unit
         support = frame_support(frames, drive.motions[-LAST_STEPS * len(frames) :]).tolist()
-        return [
-            LivePose(
-                k,
-                pose.copy(),
-                self._state(k in drive.unusable),
-                unit,
-                None if k in unasked else share,
-            )
-            for k, pose, share in zip(frames, self._T_world_camera[first:], support)
-        ]
+        poses: list[LivePose] = []
+        for index, pose, share in zip(frames, self._T_world_camera[first:], support):
+            state = self._state(index in drive.unusable)
+            support_of = None if index in unasked else share
+            poses.append(LivePose(index, pose.copy(), state, unit, support_of))
+        return poses
 
     def correct(self, T_world_camera: FloatArray, scale: Scale) -> None:
         """Go on from the poses ``(N, 4, 4)`` and the unit of a whole drive."""
@@ -222,6 +218,14 @@ class Slam:
     ) -> Slam:
         """With a shipped model by name or a training output folder; depth is that of ``config.depth``.
 
+        Args:
+            name_or_dir: a shipped model, or a training output folder.
+            intrinsics: of all images.
+            config: None for the defaults.
+            camera_height_m: above the road, metres; None where unknown.
+            device: auto, cpu or cuda.
+            with_map: keep images on disk, for `surface` and `clouds`.
+
         Raises:
             SlamError: as the constructor; a depth source that cannot be opened, or a folder of files.
             ErfsfmError: as ``DepthPosePredictor.from_weights``.
@@ -332,9 +336,12 @@ class Slam:
         return estimate.optimised.select(np.array([view.index for view in estimate.views], np.intp))
 
     def points(self) -> FloatArray:
-        """Points ``(M, 3)`` of the corners of `keyframes` in the world, in `unit_name`; raises as `keyframes`.
+        """Points ``(M, 3)`` of the corners of `keyframes` in the world, in `unit_name`.
 
         Those of a hand-held camera are triangulated among neighbouring keyframes, those of a drive have learned depth.
+
+        Raises:
+            SlamError: as `keyframes`.
         """
         estimate = self._solved()
         places = estimate.places(self._sequence.intrinsics)
@@ -348,7 +355,14 @@ class Slam:
         return np.asarray(points[np.isfinite(points).all(axis=1)])
 
     def marginals(self, frame: int) -> FloatArray:
-        """Covariance ``(6, 6)`` of a frame's pose, as `PoseGraph.marginal`; raises as `keyframes`, or without one."""
+        """Covariance ``(6, 6)`` of a frame's pose, as `PoseGraph.marginal`.
+
+        Args:
+            frame: its number, from 0.
+
+        Raises:
+            SlamError: as `keyframes`; the drive has no graph, or no such frame.
+        """
         graph = self._solved().graph
         if isinstance(graph, Failed):
             raise SlamError(graph.reason)

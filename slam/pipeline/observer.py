@@ -92,7 +92,16 @@ class Observer:
         seed: int = 0,
         camera_height_m: float | None = None,
     ) -> None:
-        """Prepare for the first frame; ``seed`` is that of all RANSAC draws, ``camera_height_m`` None where unknown."""
+        """Prepare for the first frame.
+
+        Args:
+            predictor: of depth and snippet poses.
+            intrinsics: of all images.
+            config: all settings.
+            stopwatch: that times the stages.
+            seed: of all RANSAC draws.
+            camera_height_m: above the road, metres; None where unknown.
+        """
         self._predictor, self._config, self._stopwatch = predictor, config, stopwatch
         self.drive = Drive()  # the measurements so far
         self.gate = ImageGate()

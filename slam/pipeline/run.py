@@ -84,7 +84,16 @@ class SlamPipeline:
         seed: int = 0,
         gps_track: GpsTrack | None = None,
     ) -> None:
-        """Prepare a run; ``seed`` is that of all RANSAC draws, ``progress`` is called with stage, done and total."""
+        """Prepare a run.
+
+        Args:
+            sequence: of the frames.
+            predictor: of depth and snippet poses.
+            config: all settings.
+            progress: is called with a stage, how many steps of it are done, and how many there are.
+            seed: of all RANSAC draws.
+            gps_track: fixes beside the images, or None.
+        """
         self.sequence, self._predictor, self._config = sequence, predictor, config
         self._progress, self._seed, self._gps_track = progress, seed, gps_track
         self.mode = resolve_mode(config.scale, sequence.camera_height_m, gps_track is not None)

@@ -111,6 +111,15 @@ def open_prediction(
 ) -> Prediction:
     """Networks by the name of shipped weights or a training output folder, with depth as configured.
 
+    Args:
+        weights: the name of shipped weights, or a training output folder.
+        device: auto, cpu or cuda.
+        depth: which source of depth.
+        intrinsics: of the images.
+        numbers: of the frames; None where they are not known beforehand, as live.
+        undistort: what is done with the images as they are read, for depth files of the stored
+            ones.
+
     Raises:
         SlamError: as `open_depth`.
         ErfsfmError: as ``DepthPosePredictor.from_weights``.

@@ -63,7 +63,15 @@ class DepthSource(Protocol):
     sha256: str
 
     def disparity(self, frame: Frame) -> Disparity:
-        """1/depth ``(h, w)`` of any size, NaN where unknown."""
+        """1/depth ``(h, w)`` of any size, NaN where unknown.
+
+        Args:
+            frame: its image is ``(H, W, 3)``; a source of files reads its index alone.
+
+        Raises:
+            SlamError: the file of this frame is missing or was changed, or the network fails on its
+                image.
+        """
 
 
 class SourcedPredictor:
@@ -107,19 +115,21 @@ class SourcedPredictor:
         snippet = self._networks.snippet(list(frames))
         if self._align != "none":
             return snippet
-        by_distance = sorted(
-            frames, key=lambda frame: (abs(frame.index - snippet.target), -frame.index)
-        )
-        units = (self._aligned(frame)[1] for frame in by_distance)
-        unit = next((unit for unit in units if not np.isnan(unit)), None)
-        if unit is None:
-            raise SlamError(
-                f"frames {frames[0].index} to {frames[-1].index} have no known depth in {self._source.name} (zero, "
-                "negative or not finite): check depth.kind and depth.source"
-            )
         T_source_target = snippet.T_source_target.copy()
-        T_source_target[:, :3, 3] *= unit
+        T_source_target[:, :3, 3] *= self._unit_near(snippet.target, frames)
         return replace(snippet, T_source_target=T_source_target)
+
+    def _unit_near(self, target: int, frames: Sequence[Frame]) -> float:
+        """The unit of the frame nearest to the target with known depth; of two as near the later."""
+        by_distance = sorted(frames, key=lambda frame: (abs(frame.index - target), -frame.index))
+        for frame in by_distance:
+            _, unit = self._aligned(frame)
+            if not np.isnan(unit):
+                return unit
+        raise SlamError(
+            f"frames {frames[0].index} to {frames[-1].index} have no known depth in "
+            f"{self._source.name} (zero, negative or not finite): check depth.kind and depth.source"
+        )
 
     def _aligned(self, frame: Frame) -> tuple[DepthMap, float]:
         """Depth ``(H, W)``, and the source's unaligned depth over the networks', NaN where unknown."""
@@ -130,10 +140,8 @@ class SourcedPredictor:
         disparity = self._source.disparity(frame)
         disparity = at_size(disparity, height, width)
         step = max(int(np.sqrt(height * width / _COMPARED)), 1)
-        own, wanted = (
-            map_[::step, ::step].astype(np.float64)
-            for map_ in (disparity, 1 / self._networks.depth(frame))
-        )
+        own = disparity[::step, ::step].astype(np.float64)
+        wanted = (1 / self._networks.depth(frame))[::step, ::step].astype(np.float64)
         known = np.isfinite(own)
         own, wanted = own[known], wanted[known]
         if len(own) < _LEAST_COMPARED:
@@ -317,8 +325,11 @@ def _paths_of_frames(folder: Path, suffix: str, numbers: FrameNumbers) -> dict[i
             f"one file a frame, {numbers.total} for the whole sequence{selected}"
         )
     before = numbers.start if len(files) == numbers.total else 0
-    frames = {row - before: path for row, path in zip(files.rows, files.paths, strict=True)}
-    return {index: path for index, path in frames.items() if 0 <= index < numbers.count}
+    frames: dict[int, Path] = {}
+    for row, path in zip(files.rows, files.paths, strict=True):
+        if 0 <= row - before < numbers.count:
+            frames[row - before] = path
+    return frames
 
 
 def _array(path: Path) -> NDArray[Any]:
@@ -462,7 +473,8 @@ class OnnxDepth:
             )
         kind: Kind = "disparity" if config.kind == "auto" else config.kind
         half = (0.5, 0.5, 0.5)
-        mean, std = (np.array(given or half, np.float32) for given in (config.mean, config.std))
+        mean = np.array(config.mean or half, np.float32)
+        std = np.array(config.std or half, np.float32)
         return kind, mean, std
 
     def _image_input(self, config: DepthConfig) -> tuple[Any, list[Any], int, int]:

@@ -246,9 +246,10 @@ def _depth_error(result: Estimate) -> list[dict[str, float | None]] | Failed:
     curve, unit = result.drive.depth_error.curve(), float(np.median(result.scale.per_frame))
     if not curve:
         return Failed("no step triangulated corners with learned depth")
-    return [
-        {"depth": unit * at, "bias": b, "sigma": s, "corners": count} for at, b, s, count in curve
-    ]
+    errors: list[dict[str, float | None]] = []
+    for depth, bias, sigma, corners in curve:
+        errors.append({"depth": unit * depth, "bias": bias, "sigma": sigma, "corners": corners})
+    return errors
 
 
 def _gps(result: Estimate, in_graph: bool) -> records.GpsMetrics | Failed:

@@ -62,6 +62,13 @@ class RunFolder:
 
         Where ``output`` holds an earlier run, that is removed. A ``lock`` holds the folder from now on.
 
+        Args:
+            output: the folder, as the user gave it; None for a new one with time and sequence in
+                its name.
+            results: where such a new one is made.
+            sequence: the name of what is run.
+            lock: holds the folder as long as the process runs; None for no lock.
+
         Raises:
             RunError: ``output`` exists and holds something else than a run, or the folder cannot be made.
             BusyError: another process holds ``output``.
@@ -104,7 +111,15 @@ class RunFolder:
         return folder
 
     def write(self, name: str, content: str | Callable[[Path], object]) -> None:
-        """Write a file atomically: its text, or by a function that writes it under a temporary name."""
+        """Write a file atomically: its text, or by a function that writes it under a temporary name.
+
+        Args:
+            name: of the file in the folder.
+            content: its text, or what writes it to a path.
+
+        Raises:
+            RunError: the disk is full, or the folder is not writable.
+        """
         write_atomically(self.path / name, content, RunError)
 
     def write_metrics(self, metrics: Metrics) -> None:
@@ -117,7 +132,11 @@ class RunFolder:
         write_tum(self.path / trajectory_file(name, "tum"), trajectory)
 
     def metrics(self) -> Metrics:
-        """The content of ``metrics.json``; without the file, the status of a killed run."""
+        """The content of ``metrics.json``; without the file, the status of a killed run.
+
+        Raises:
+            RunError: the file is damaged.
+        """
         try:
             return Metrics.read(self.path / METRICS)
         except FileNotFoundError:
@@ -126,16 +145,30 @@ class RunFolder:
             )
 
     def trajectory(self, name: str) -> Trajectory | None:
-        """One of the trajectories (``network``, ``optimised``, ``reference`` ...), or None where absent."""
+        """One of the trajectories (``network``, ``optimised``, ``reference`` ...), or None where absent.
+
+        Raises:
+            TrajectoryError: the file is there and cannot be read.
+        """
         path = self.path / trajectory_file(name, "tum")
         return read_trajectory(path, "tum") if path.exists() else None
 
     def mesh(self) -> Any:
-        """The map as an Open3D ``TriangleMesh``, y down; `RunError` where the run has none."""
+        """The map as an Open3D ``TriangleMesh``, y down.
+
+        Raises:
+            RunError: the run has no map.
+            SlamError: Open3D cannot be loaded.
+        """
         return import_open3d().io.read_triangle_mesh(str(self.require(MAP_MESH)))
 
     def cloud(self) -> Any:
-        """The map as an Open3D ``PointCloud``, y down; `RunError` where the run has none."""
+        """The map as an Open3D ``PointCloud``, y down.
+
+        Raises:
+            RunError: the run has no map.
+            SlamError: Open3D cannot be loaded.
+        """
         return import_open3d().io.read_point_cloud(str(self.require(MAP_CLOUD)))
 
     def _repr_html_(self) -> str:
@@ -152,7 +185,11 @@ class RunFolder:
         )
 
     def require(self, name: str) -> Path:
-        """The path of a file of the run."""
+        """The path of a file of the run.
+
+        Raises:
+            RunError: the run has no such file; the message says why where the run knows.
+        """
         path = self.path / name
         if not path.is_file():
             present = ", ".join(
@@ -168,7 +205,15 @@ class RunFolder:
 
 
 def check_replaced(path: Path, begin: bytes | None = None) -> None:
-    """Check what a file would replace: a file with this ``begin``, by default any trajectory."""
+    """Check what a file would replace: a file with this ``begin``, by default any trajectory.
+
+    Args:
+        path: of the file that is to be written.
+        begin: the first bytes of a file that may be replaced; None for any trajectory.
+
+    Raises:
+        RunError: it is a folder, a file of a run, or a file of another kind.
+    """
     if path.is_dir():
         raise RunError(f"{path} is a folder: give the name of a file to write")
     if path.name in MEANINGS and any(
@@ -192,7 +237,11 @@ def _is_of_kind(path: Path, begin: bytes | None) -> bool:
 
 
 def check_output(output: Path) -> None:
-    """Check that a run may write to ``output``: it is new, empty, or holds an earlier run."""
+    """Check that a run may write to ``output``: it is new, empty, or holds an earlier run.
+
+    Raises:
+        RunError: it is a broken link, a file, or a folder with something else than a run.
+    """
     if output.is_symlink() and not output.exists():
         raise RunError(
             f"{output} is a link to {output.readlink()}, which is not there: choose another --output"

@@ -44,7 +44,11 @@ class EmptyMapError(SlamError):
 
 @contextmanager
 def sequence_errors() -> Iterator[None]:
-    """Raise what the readers of `erfsfm.common.readers` refuse as a `SequenceError`; also a decorator."""
+    """Raise what the readers of `erfsfm.common.readers` refuse as a `SequenceError`; also a decorator.
+
+    Raises:
+        SequenceError: with the words of a `DataError` raised inside.
+    """
     try:
         yield
     except DataError as error:

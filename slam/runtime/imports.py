@@ -28,7 +28,11 @@ _WINDOWS = "open3d.visualization"
 
 @functools.cache
 def import_open3d() -> ModuleType:
-    """Import Open3D, loading the libusb that its wheels link but do not ship."""
+    """Import Open3D, loading the libusb that its wheels link but do not ship.
+
+    Raises:
+        SlamError: it, or the libusb that it needs, cannot be loaded.
+    """
     try:
         libusb_package = importlib.import_module("libusb_package")
         ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
@@ -62,7 +66,11 @@ def _without_windows() -> ModuleType:
 
 
 def import_extra(extra: str) -> tuple[ModuleType, ...]:
-    """Import the modules of an optional extra of the package, in the order of `EXTRAS`."""
+    """Import the modules of an optional extra of the package, in the order of `EXTRAS`.
+
+    Raises:
+        SlamError: the extra is not installed; the message says how to install it.
+    """
     needs, modules = EXTRAS[extra]
     try:
         return tuple(importlib.import_module(name) for name in modules)
@@ -77,7 +85,11 @@ def plug_ins(group: str) -> dict[str, EntryPoint]:
 
 
 def import_plug_in(point: EntryPoint) -> Any:
-    """What an entry point names."""
+    """What an entry point names.
+
+    Raises:
+        SlamError: it cannot be loaded; the message names its package.
+    """
     try:
         return point.load()
     except (ImportError, AttributeError, OSError) as error:

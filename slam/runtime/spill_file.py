@@ -24,7 +24,11 @@ class SpillFile:
         self._lock = Lock()  # the file has one position, which every write and read moves
 
     def put(self, array: NDArray[Any]) -> SpilledArray:
-        """Write an array."""
+        """Write an array.
+
+        Raises:
+            SlamError: the disk is full.
+        """
         content = np.ascontiguousarray(array)
         try:
             with self._lock:
@@ -41,7 +45,16 @@ class SpillFile:
         return SpilledArray(self, start, content.shape, content.dtype)
 
     def read(self, start: int, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-        """An array that was put at ``start``."""
+        """An array that was put at ``start``.
+
+        Args:
+            start: the first byte.
+            shape: of the array.
+            dtype: of its values.
+
+        Raises:
+            SlamError: the disk cannot be read.
+        """
         count = int(np.prod(shape))
         try:
             with self._lock:

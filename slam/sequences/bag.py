@@ -101,7 +101,11 @@ class Bag:
             yield self.parse(topic, data)
 
     def first(self, topic: str) -> Any:
-        """The first message of a topic."""
+        """The first message of a topic.
+
+        Raises:
+            SequenceError: the topic has no messages, or the bag cannot be read.
+        """
         message = next(self.messages(topic), None)
         if message is None:
             raise SequenceError(f"topic {topic} of {self.path} has no messages")
@@ -198,7 +202,16 @@ def shows_pictures(message: Any, topic: str) -> bool:
 
 
 def values_of(message: Any, where: str) -> NDArray[Any]:
-    """The values ``(H, W, C)`` of an ``Image`` as stored, or those of a ``CompressedImage``."""
+    """The values ``(H, W, C)`` of an ``Image`` as stored, or those of a ``CompressedImage``.
+
+    Args:
+        message: of the bag.
+        where: its name, for errors.
+
+    Raises:
+        SequenceError: the encoding is unknown, or bytes are missing.
+        DataError: a compressed image cannot be decoded.
+    """
     if hasattr(message, "format"):
         return decode_values(bytes(message.data), where)
     encoding = message.encoding
@@ -223,6 +236,15 @@ def image_of(message: Any, where: str, stretch: Stretch | None = None) -> Image:
     """The picture ``(H, W, 3)`` uint8 RGB of an ``Image`` or a ``CompressedImage``.
 
     Values of 16 bits are stretched; without a ``stretch`` by their own range.
+
+    Args:
+        message: of the bag.
+        where: its name, for errors.
+        stretch: of 16 bits to 8; None for that of this image.
+
+    Raises:
+        SequenceError: the encoding is unknown, or bytes are missing.
+        DataError: a compressed image cannot be decoded.
     """
     if hasattr(message, "format"):
         return decode_image(bytes(message.data), where, stretch)
@@ -241,6 +263,17 @@ def camera_file_of(
 
     The calibration is of the whole sensor; images are its region of interest, binned (REP 104). Some drivers state a
     binning of images that are whole: those of ``size`` (width, height) as large as the calibration are.
+
+    Args:
+        info: the ``CameraInfo``.
+        rectified: whether the images are.
+        fps: their rate, frames a second.
+        where: the name of the message, for errors.
+        size: width and height of the images, pixels; None where they are not known.
+
+    Raises:
+        SequenceError: the lens is unknown, or there is no calibration.
+        DataError: the calibration is impossible.
     """
     K, P, distortion = (
         getattr(info, key.upper() if hasattr(info, key.upper()) else key) for key in "kpd"
@@ -255,11 +288,9 @@ def camera_file_of(
         raise SequenceError(
             f"{where} has no calibration, its focal length is {fx:g}: give --camera"
         )
-    width, height, roi = (
-        info.width or (size or (0, 0))[0],
-        info.height or (size or (0, 0))[1],
-        info.roi,
-    )
+    width = info.width or (size or (0, 0))[0]
+    height = info.height or (size or (0, 0))[1]
+    roi = info.roi
     if size != (width, height):
         binning_x, binning_y = max(info.binning_x, 1), max(info.binning_y, 1)
         if roi.width and roi.height:
@@ -281,7 +312,15 @@ def is_rectified(topic: str) -> bool:
 
 
 def points_of(cloud: Any, where: str) -> FloatArray:
-    """The finite points ``(P, 3)`` of a ``PointCloud2`` in its frame, metres."""
+    """The finite points ``(P, 3)`` of a ``PointCloud2`` in its frame, metres.
+
+    Args:
+        cloud: a ``PointCloud2``.
+        where: its name, for errors.
+
+    Raises:
+        DataError: x, y and z are not there as float32, or bytes are missing.
+    """
     offsets = {field.name: field.offset for field in cloud.fields if field.datatype == _FLOAT32}
     if not {"x", "y", "z"} <= offsets.keys():
         raise DataError(f"{where} has no x, y and z as float32")
@@ -289,10 +328,8 @@ def points_of(cloud: Any, where: str) -> FloatArray:
     data: NDArray[np.uint8] = np.asarray(cloud.data, dtype=np.uint8)
     if len(data) < count * step:
         raise DataError(f"{where} has {len(data)} bytes for {count} points of {step}")
-    formats, places = (
-        [f"{'>' if cloud.is_bigendian else '<'}f4"] * 3,
-        [offsets[axis] for axis in "xyz"],
-    )
+    formats = [f"{'>' if cloud.is_bigendian else '<'}f4"] * 3
+    places = [offsets[axis] for axis in "xyz"]
     layout = np.dtype(
         {"names": list("xyz"), "formats": formats, "offsets": places, "itemsize": step}
     )

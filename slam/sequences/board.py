@@ -55,7 +55,11 @@ class Board:
         return self.square_m * np.stack([column.ravel(), row.ravel(), np.zeros(row.size)], axis=1)
 
     def charuco(self) -> Any:
-        """OpenCV's ChArUco board."""
+        """OpenCV's ChArUco board.
+
+        Raises:
+            SlamError: the dictionary is none of OpenCV's, or has too few markers.
+        """
         number = getattr(cv2.aruco, f"DICT_{self.dictionary}", None)
         if number is None or not _DICTIONARY.fullmatch(self.dictionary):
             raise SlamError(
@@ -81,6 +85,11 @@ def found_corners(grey: Grey, board: Board, detector: Any) -> tuple[FloatArray, 
 
     A chessboard is found only as a whole; of a ChArUco board, by its ``detector``, 12 corners will do, not all in one
     line.
+
+    Args:
+        grey: the image ``(H, W)`` uint8.
+        board: that is sought.
+        detector: of a ChArUco board; None for a chessboard.
     """
     corners_m = board.corners_m
     if detector is None:
@@ -108,7 +117,11 @@ def _refined(grey: Grey, pixels: Any, window: float) -> FloatArray:
 
 
 def parse_board(text: str) -> tuple[int, int]:
-    """Columns and rows of corners from ``9x6``."""
+    """Columns and rows of corners from ``9x6``.
+
+    Raises:
+        SlamError: it is not such a text, or has fewer than 3 corners a side.
+    """
     match = _BOARD.fullmatch(text)
     columns, rows = (int(match[1]), int(match[2])) if match else (0, 0)
     if min(columns, rows) < _FEWEST:

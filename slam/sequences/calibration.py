@@ -79,6 +79,12 @@ class Calibration:
 def fit_camera(views: list[View], width: int, height: int, model: Model) -> Calibration:
     """Fit a camera to views of a board; views that fit three times worse than the median are left out.
 
+    Args:
+        views: of one board.
+        width: of the images, pixels.
+        height: of the images, pixels.
+        model: of the lens.
+
     Raises:
         SlamError: the views do not determine the camera, or no camera explains them.
     """

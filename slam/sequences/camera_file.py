@@ -77,6 +77,10 @@ def find_camera_file(
         images: the images that it took, for a camera by its field of view.
         fps: their rate where known, for the same; 10 a second otherwise.
         own: reads the calibration of the recording, where it has one; not called where the user gave another.
+
+    Raises:
+        SequenceError: no camera was given and none is found, or what was given is none.
+        DataError: a camera file that is found is malformed.
     """
     if explicit is not None:
         return explicit_camera(explicit, images, fps)
@@ -101,6 +105,10 @@ def explicit_camera(given: Path, images: Sized, fps: float | None = None) -> Cam
     """The camera that the user named; arguments as in `find_camera_file`.
 
     That of a field of view is a pinhole with square pixels and the principal point in the middle.
+
+    Raises:
+        SequenceError: there is no such file, or the field of view is impossible.
+        DataError: the file is malformed, or its lens is unknown.
     """
     if not is_field_of_view(given):
         return read_explicit(given, fps)
@@ -126,7 +134,12 @@ def explicit_camera(given: Path, images: Sized, fps: float | None = None) -> Cam
 
 
 def read_explicit(path: Path, fps: float | None = None) -> CameraFile:
-    """Read the camera file that the user named, ours or of another program; ``fps`` is for one without a rate."""
+    """Read the camera file that the user named, ours or of another program; ``fps`` is for one without a rate.
+
+    Raises:
+        SequenceError: there is no such file.
+        DataError: it is malformed, or its lens is unknown.
+    """
     if not path.is_file():
         raise SequenceError(f"no camera file {path}: give a {CAMERA_FILE}, or fov=DEGREES")
     return _read_foreign(path, fps or DEFAULT_FPS) or read_camera_file(path)
@@ -190,7 +203,11 @@ def read_opencv_yaml(path: Path) -> Any:
 
 
 def lens_model(name: str | None) -> Literal["pinhole", "opencv", "fisheye"]:
-    """The model of ``camera.yaml`` of a lens as another program names it; ``DataError`` where it is unknown."""
+    """The model of ``camera.yaml`` of a lens as another program names it.
+
+    Raises:
+        DataError: it is unknown.
+    """
     if name not in LENSES:
         raise DataError(
             f"the lens model {name} is unknown: known are {', '.join(filter(None, LENSES))}; give --camera"
@@ -303,7 +320,11 @@ class Undistortion:
         self._maps = np.ascontiguousarray(seen[..., 0]), np.ascontiguousarray(seen[..., 1])
 
     def apply(self, image: Image) -> Image:
-        """Undistort an image ``(H, W, 3)``."""
+        """Undistort an image ``(H, W, 3)``.
+
+        Raises:
+            SequenceError: the image has another size than its camera.
+        """
         camera, (height, width) = self.intrinsics, image.shape[:2]
         if (width, height) != (camera.width, camera.height):
             raise SequenceError(
@@ -364,7 +385,17 @@ class Undistortion:
 
 
 def require_size(images: Sized, camera: CameraFile, where: str) -> None:
-    """Refuse images of another size than their camera."""
+    """Refuse images of another size than their camera.
+
+    Args:
+        images: all of one size.
+        camera: that took them.
+        where: the recording, for the message.
+
+    Raises:
+        SequenceError: the sizes differ; the message has the keys of a camera file at the right
+            size.
+    """
     if (images.width, images.height) == (camera.width, camera.height):
         return
     if (images.width, images.height) == (camera.height, camera.width):

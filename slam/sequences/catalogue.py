@@ -308,6 +308,14 @@ def open_series(pieces: Sequence[Piece], openers: Sequence[Opener]) -> RecordedS
 
     A piece that is missing between two others is a gap, as long as its name says or as the piece before. Clips much
     shorter than the regular distance of their names follow each other: their names do not tell when they begin.
+
+    Args:
+        pieces: of one recording, in order.
+        openers: what opens each piece.
+
+    Raises:
+        SequenceError: a piece is of another camera, or a bag does not go on where the one before it
+            ends.
     """
     parts = [opener() for opener in openers]
     first = parts[0]

@@ -30,6 +30,10 @@ def read_gps(path: Path) -> GpsTrack:
     CSV has a header with ``stamp`` in seconds on the clock of the images, ``latitude`` and ``longitude`` in degrees,
     ``altitude`` in metres and, optionally, ``hdop``. Of NMEA, GGA sentences are read; their stamps are seconds of the
     first day.
+
+    Raises:
+        SequenceError: the file cannot be read, holds no fix with an altitude, or moves at an
+            impossible speed.
     """
     text = text_of(path, SequenceError, "a GPS track")
     lines = text.splitlines()

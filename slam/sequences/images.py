@@ -33,7 +33,16 @@ class ImageSource(Sized, Protocol):
         """Number of images."""
 
     def read(self, index: int, /) -> Image:
-        """One image ``(height, width, 3)`` uint8 RGB; ``SequenceError`` or ``DataError`` where it cannot be read."""
+        """One image ``(height, width, 3)`` uint8 RGB.
+
+        Args:
+            index: row of the image, from 0.
+
+        Raises:
+            SequenceError: it cannot be read, or has another size; `MissingFrameError` where its
+                number is missing.
+            DataError: the file is damaged.
+        """
 
 
 @dataclass(frozen=True)
@@ -54,7 +63,12 @@ class ImageFiles:
     """Images on disk, one row a number, all of the size of the first readable ones."""
 
     def __init__(self, files: NumberedFiles) -> None:
-        """Read the first readable images for their size."""
+        """Read the first readable images for their size.
+
+        Raises:
+            SequenceError: a gap in the numbers is too long to be interpolated.
+            DataError: no image can be read.
+        """
         self.files = files
         for first, last in files.gaps():
             if last - first + 1 > _MAX_GAP_FRAMES:
@@ -69,7 +83,13 @@ class ImageFiles:
         return len(self.files)
 
     def read(self, index: int) -> Image:
-        """One image ``(height, width, 3)`` uint8 RGB; ``MissingFrameError`` where the frame's number is missing."""
+        """One image ``(height, width, 3)`` uint8 RGB.
+
+        Raises:
+            MissingFrameError: the frame's number is missing.
+            SequenceError: the image has another size than the first.
+            DataError: the image cannot be read.
+        """
         path = self._paths.get(index)
         if path is None:
             folder = self.files.paths[0].parent

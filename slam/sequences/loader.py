@@ -69,7 +69,12 @@ class Loader:
 
 
 def open_folder(folder: Path, asked: Path | None) -> RecordedSequence:
-    """Open a folder of images in natural order, at the stamps of its ``times.txt`` or the camera's frame rate."""
+    """Open a folder of images in natural order, at the stamps of its ``times.txt`` or the camera's frame rate.
+
+    Raises:
+        SequenceError: there are no images or no camera, or their stamps do not match.
+        DataError: no image can be read, or the camera file is malformed.
+    """
     where = image_folder(folder)
     if where is None:
         raise SequenceError(

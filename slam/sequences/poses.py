@@ -56,6 +56,12 @@ def poses_near(
 
     The motion goes on at both ends. NaN, with a warning, where the nearest known pose is more than 0.1 s away; of poses
     as rare as images a missing one is bridged, up to 0.3 s.
+
+    Args:
+        T_any_camera: known poses ``(M, 4, 4)`` in any world.
+        known: their stamps ``(M,)``, increasing, seconds.
+        stamps: of the images ``(N,)``, seconds.
+        path: where they were read, for the warning.
     """
     if np.array_equal(known, stamps):
         return T_any_camera
@@ -98,7 +104,15 @@ def known_poses(T_any_camera: FloatArray) -> NDArray[np.bool_]:
 
 
 def read_matrix(path: Path, what: str) -> FloatArray:
-    """A file of 4 x 4 numbers, which describe what it says."""
+    """A file of 4 x 4 numbers, which describe what it says.
+
+    Args:
+        path: of the file.
+        what: the numbers describe, for the message.
+
+    Raises:
+        SequenceError: the file cannot be read, or does not hold 16 numbers.
+    """
     try:
         return np.array(read_text(path).split(), dtype=np.float64).reshape(4, 4)
     except (OSError, ValueError) as error:
@@ -109,6 +123,13 @@ def pose_files(paths: list[Path], stamps: FloatArray) -> FloatArray | None:
     """`poses_near` of files of 4 x 4 numbers, one an image, some of which may be missing; None where all are.
 
     Numbers that are not finite are those of a camera that lost track.
+
+    Args:
+        paths: a file an image.
+        stamps: of the images ``(N,)``, seconds.
+
+    Raises:
+        SequenceError: a file does not hold 16 numbers, or no pose.
     """
     there = [
         (stamp, path, read_matrix(path, "a pose"))
@@ -133,6 +154,10 @@ def read_truth(path: Path, stamps: FloatArray) -> FloatArray:
 
     Rows with stamps belong to the frames of these times, rows with frame numbers to these frames, and others to the
     frames one by one; NaN where unknown.
+
+    Raises:
+        SequenceError: its rows are not as many as frames, or it covers none of them.
+        TrajectoryError: the file cannot be read as a trajectory.
     """
     truth, frames = read_trajectory(path), len(stamps)
     numbers = truth.frame_numbers

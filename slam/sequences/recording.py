@@ -117,7 +117,15 @@ class RecordedSequence:
         self.take_truth(self.T_any_camera)
 
     def cut(self, start: int, stop: int) -> Self:
-        """The frames [start, stop) as a sequence of their own; stamps stay, poses begin at the identity."""
+        """The frames [start, stop) as a sequence of their own; stamps stay, poses begin at the identity.
+
+        Args:
+            start: the first frame of the part.
+            stop: the frame after its last one.
+
+        Raises:
+            SequenceError: the sequence has no such frames.
+        """
         if not 0 <= start < stop <= len(self):
             raise SequenceError(
                 f"no frames {start}:{stop} in sequence {self.name}: it has {len(self)}"
@@ -150,7 +158,12 @@ class RecordedSequence:
         return len(self.stamps)
 
     def frame(self, index: int) -> Frame:
-        """Read one frame; ``MissingFrameError`` where its number is missing from the files."""
+        """Read one frame.
+
+        Raises:
+            SequenceError: there is no such frame, or its image cannot be read; `MissingFrameError`
+                where its number is missing from the files.
+        """
         if not 0 <= index < len(self):
             raise SequenceError(
                 f"no frame {index} in sequence {self.name}: it has frames 0 to {len(self) - 1}"
@@ -166,7 +179,11 @@ class RecordedSequence:
         return self.start + index in self.scans
 
     def scan(self, index: int) -> FloatArray:
-        """The points ``(P, 3)`` of a frame's scan, metres, in the LiDAR."""
+        """The points ``(P, 3)`` of a frame's scan, metres, in the LiDAR.
+
+        Raises:
+            SequenceError: the frame has no scan, or it cannot be read.
+        """
         if not self.has_scan(index):
             raise SequenceError(f"frame {index} of {self.name} has no scan")
         with sequence_errors():
@@ -234,6 +251,13 @@ def frame_range(text: str, frames: int) -> tuple[int, int]:
     """Read ``A:B`` as Python reads a slice of so many frames: half-open, either end optional or negative.
 
     Unlike in Python, an end beyond the sequence is an error.
+
+    Args:
+        text: the option of the user.
+        frames: their number in the sequence.
+
+    Raises:
+        SequenceError: it is no range, is empty, or reaches outside of the sequence.
     """
     try:
         begin, end = text.split(":")
@@ -283,6 +307,9 @@ def require_stamps(stamps: FloatArray, path: Path, files: NumberedFiles) -> Floa
             interpolated.
         path: where they were read.
         files: images, or packets of a GPS/INS.
+
+    Raises:
+        SequenceError: there are not as many as files, or too few of them are usable.
     """
     assigned = files.rows_of(len(stamps))
     if assigned is None:

@@ -98,7 +98,11 @@ class StampedMessages:
         return len(self._numbers)
 
     def read(self, index: int) -> Any:
-        """One message."""
+        """One message.
+
+        Raises:
+            SequenceError: the bag breaks off before it.
+        """
         number = self._numbers[index]
         if not self._next <= number <= self._next + _SKIPPED_FRAMES or self._next == 0:
             time_ns = self._times_ns[number]
@@ -120,7 +124,16 @@ class StampedMessages:
 
 
 def images_of(messages: StampedMessages, where: str) -> ReadImages:
-    """The images of a topic, all of the size of the first readable ones; not for use from several threads."""
+    """The images of a topic, all of the size of the first readable ones; not for use from several threads.
+
+    Args:
+        messages: of a topic of images.
+        where: its name, for errors.
+
+    Raises:
+        SequenceError: an image cannot be read; also later, where one has another size.
+        DataError: no image can be decoded.
+    """
     rows = range(len(messages))
     stretch = stretch_of(rows, lambda row: bags.values_of(messages.read(row), where))
 
@@ -202,7 +215,18 @@ def transform_of(message: Any) -> FloatArray:
 
 
 def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> RecordedSequence:
-    """Open the images of a topic with what the bag has beside: calibration, true poses, LiDAR scans."""
+    """Open the images of a topic with what the bag has beside: calibration, true poses, LiDAR scans.
+
+    Args:
+        path: of the bag.
+        topic: of its images.
+        name: of the sequence.
+        asked: the camera that the user gave, or None.
+
+    Raises:
+        SequenceError: there are no messages, no calibration, or no image that can be read.
+        SlamError: the extra ``ros`` is not installed.
+    """
     bag = Bag(path)
     messages = StampedMessages(bag, topic)
     stored, stamps = images_of(messages, f"an image of {topic} in {bag.path}"), messages.stamps

@@ -64,6 +64,17 @@ class StreamedSequence(GrowingSequence):
         """``source`` is read from the first frame on until it sends nothing for ``most_wait_s``.
 
         With ``every_frame`` it waits until each image was taken.
+
+        Args:
+            name: of the sequence.
+            source: of the images.
+            camera: that takes them; where its lens is distorted they are undistorted.
+            most_wait_s: after so many seconds without an image the source is over.
+            every_frame: whether the source waits for the system; a stored one can.
+
+        Raises:
+            SequenceError: the images have another size than the camera, or a live source is asked
+                to wait.
         """
         require_size(source, camera, name)
         if every_frame and not source.is_stored:
@@ -142,7 +153,15 @@ class FolderSource:
     is_stored = True
 
     def __init__(self, folder: Path, wait_s: float) -> None:
-        """Wait up to ``wait_s`` for the first image that can be read; it gives the size."""
+        """Wait up to ``wait_s`` for the first image that can be read; it gives the size.
+
+        Args:
+            folder: that is filled.
+            wait_s: for the first image, seconds.
+
+        Raises:
+            SequenceError: no image came in time, or the folder cannot be read.
+        """
         self._folder, self.fps = folder, DEFAULT_FPS
         self._past: set[str] = set()
         self._stretch: Stretch | None = None
@@ -231,7 +250,15 @@ class VideoSource:
     """A source that OpenCV opens: a camera's number, a stream's address, or a file, played at its own speed."""
 
     def __init__(self, name: str, wait_s: float) -> None:
-        """Open it; a stream or a camera within ``wait_s``, and again within ``wait_s`` where it breaks off."""
+        """Open it; a stream or a camera within ``wait_s``, and again within ``wait_s`` where it breaks off.
+
+        Args:
+            name: a camera's number, a stream's address, or a file.
+            wait_s: for the first image, and where it breaks off, seconds.
+
+        Raises:
+            SequenceError: it is a pipe, or no image comes.
+        """
         self._name, self._wait_s = name, wait_s
         self.is_stored = (
             Path(name).is_file() and Path(name).suffix.lower() not in _DESCRIBED_STREAMS

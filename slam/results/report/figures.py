@@ -82,7 +82,8 @@ def trajectories_figure(
 
 def map_figure(view: MapView) -> go.Figure:
     """The map in its colours with the camera's path through it, seen first from one of its places."""
-    points, path = (X @ R_UP_WORLD.T for X in (view.mesh.points, view.T_world_camera[:, :3, 3]))
+    points = view.mesh.points @ R_UP_WORLD.T
+    path = view.T_world_camera[:, :3, 3] @ R_UP_WORLD.T
     corners = view.mesh.triangles.astype(np.uint16 if len(points) < 2**16 else np.int32)
     colours = [f"#{rgb:06x}" for rgb in view.mesh.colours.astype(np.int64) @ [1 << 16, 1 << 8, 1]]
     flat = {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0, "fresnel": 0.0}
@@ -100,7 +101,8 @@ def map_figure(view: MapView) -> go.Figure:
         **_by_axis("xyz", map(_single, path.T)), mode="lines", line=line, hoverinfo="skip"
     )
     # a unit of the scene is what is near, for it is clipped at a hundredth of one
-    low, high = (f([f(points, axis=0), f(path, axis=0)], axis=0) for f in (np.min, np.max))
+    low = np.min([np.min(points, axis=0), np.min(path, axis=0)], axis=0)
+    high = np.max([np.max(points, axis=0), np.max(path, axis=0)], axis=0)
     size = np.maximum(high - low, 1e-3)
     eye, forward = path[view.frame], R_UP_WORLD @ view.T_world_camera[view.frame, :3, 2]
     places = {"eye": eye, "center": eye + view.ahead * forward}

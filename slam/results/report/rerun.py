@@ -24,6 +24,9 @@ def write_rerun(path: Path, result: Estimate, intrinsics: Intrinsics) -> None:
 
     The world is that of the optimised trajectory, y down. Images, of these ``intrinsics``, and depth, in the unit of
     the trajectory, are those of keyframes, thinned.
+
+    Raises:
+        SlamError: the extra ``rerun`` is not installed.
     """
     (rr,) = import_extra("rerun")
     keyframes = {keyframe.index: keyframe for keyframe in result.drive.keyframes}

@@ -25,8 +25,9 @@ from slam.frames import (
     resized_mask,
 )
 from slam.frontend.drive import Drive, Keyframe
+from slam.frontend.ground_plane import GroundPlaneFitter
 from slam.frontend.image_gate import ImageGate, Verdict
-from slam.frontend.road import GroundPlaneFitter, RoadHomography, RoadStep
+from slam.frontend.road import RoadHomography, RoadStep
 from slam.frontend.tracking import ROTATION_BASELINE
 from slam.frontend.visual.motion import Motion, path_between, shortest_by_start
 from slam.frontend.visual.odometry import VisualOdometry

@@ -368,9 +368,9 @@ def _find(path: Path, asked: Asked) -> dict[str, Opener]:
         return found
     cameras = _cameras(path, asked)
     if not cameras:
-        with closing(Bag(path)) as bag:
+        with closing(Bag(path)) as opened:
             held = (
-                ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.types.items()))
+                ", ".join(f"{topic} ({kind})" for topic, kind in sorted(opened.types.items()))
                 or "nothing"
             )
         raise SequenceError(f"bag {path} has no topic with images of a camera: it holds {held}")

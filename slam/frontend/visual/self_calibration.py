@@ -36,6 +36,9 @@ _PRIOR_SIGMA = 0.2
 _LEAST_SIGMA = 0.1
 _USUAL_SIGMA = 0.15
 _USUAL_FAR_SIGMA = 0.25
+# what moves along with the camera, as a car beside it, is triangulated far behind its place: no error of learned depth
+_LEAST_RATIO = float(np.exp(_LOGARITHMS[0]))
+_SURE_SIGMAS = 2.0
 _FOCAL_STEP = 0.01  # of the logarithm, for its derivative
 _LEAST_SIGMA_PX = 1e-3
 _CORRELATION = (
@@ -92,6 +95,9 @@ class DepthError:
             length: of the motion, in the unit of learned depth.
         """
         known = np.isfinite(learned)
+        known[known] = (nearness + _SURE_SIGMAS * sigma)[known] * learned[
+            known
+        ] > _LEAST_RATIO * length
         ratio, spread = (learned[known] * values[known] / length for values in (nearness, sigma))
         weights = 1.0 / (1.0 + (spread / _USUAL_SIGMA) ** 2)
         corners, noise = _KEPT * self.corners, _KEPT * self.noise

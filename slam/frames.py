@@ -74,12 +74,15 @@ class Intrinsics(Pinhole):
 class Frame:
     """One image of a sequence: ``image`` ``(H, W, 3)`` uint8 RGB, ``stamp`` in seconds.
 
-    Values that depend on the image alone (grey levels, the networks' input) are computed once and kept.
+    ``fixed`` ``(h, w)``, of any size, is True where the image shows what is fixed to the camera, as the
+    bonnet; None where all of it shows the world. Values that depend on the image alone (grey levels, the
+    networks' input) are computed once and kept.
     """
 
     index: int
     stamp: float
     image: Image
+    fixed: Mask | None = None
     _derived: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
 
     def derived(self, key: Hashable, make: Callable[[], T]) -> T:
@@ -88,6 +91,12 @@ class Frame:
             self._derived.setdefault(key, make())
         known: T = self._derived[key]
         return known
+
+    def is_fixed(self, pixels: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
+        """Which pixels ``(M, 2)`` show what is fixed to the camera ``(M,)``."""
+        if self.fixed is None:
+            return np.zeros(len(pixels), np.bool_)
+        return nearest(resized_mask(self.fixed, *self.image.shape[1::-1]), pixels)
 
     @property
     def grey(self) -> Grey:

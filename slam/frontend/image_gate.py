@@ -1,7 +1,5 @@
 """Detection of images that show nothing new or nothing at all, before they are measured: blank, noise, frozen.
 
-Also of the pixels that stand still while the camera moves: bars, logos, the bonnet of the car.
-
 Whether an image shows the scene of the one before is not asked here: tracking finds out.
 """
 
@@ -13,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import Frame, Grey, Mask, slopes_of
+from slam.frames import Frame, Grey, slopes_of
 from slam.runtime.errors import Failed
 
 _THUMBNAIL = (32, 16)  # width, height
@@ -30,11 +28,6 @@ _LARGEST_COPY = 2.0
 _EXPOSURE_STEP = 0.1
 _BLANK_CONTRAST = 3.0  # standard deviation of grey levels below which a frame is blank
 _NOISE_CONTRAST = 0.3  # contrast after blurring over contrast before, below which a frame is noise
-# pixels stand whose grey level changes by less in the mean, and that of half of the image by much
-# more
-_STANDING_GREY, _MOVING_GREY = 0.7, 4.0
-_BRIGHT_GREY = 235.0  # the sky does not change where the camera sees white
-_STANDING_IMAGES, _REMEMBERED_IMAGES = 20, 50
 # largest difference of a re-encoded copy to its image, over the mean image gradient
 _REPEAT_DIFFERENCE = 0.1
 
@@ -45,19 +38,15 @@ _Layer = NDArray[np.float32]
 class ImageGate:
     """Classifies the images of one sequence in time order.
 
-    Of all ``compared`` images, ``exposed`` are much brighter or darker than the one before. Those
-    pixels are ``standing`` ``(h, w)`` that do not move with the others; None where there are none.
+    Of all ``compared`` images, ``exposed`` are much brighter or darker than the one before.
     """
 
     def __init__(self) -> None:
         self.compared = self.exposed = 0
-        self.standing: Mask | None = None
         self._last: Frame | None = None
         self._verdict: Verdict = "new"
         self._shrunk: _Layer | None = None  # the last new image at a quarter of its size
         self._difference = 0.0  # of that from the one before
-        self._change: _Layer | None = None  # of its pixels, the mean over the images that moved
-        self._moved = 0
 
     @property
     def was_moving(self) -> bool:
@@ -93,13 +82,7 @@ class ImageGate:
         """
         before = self._shrunk
         if before is None or before.shape != shrunk.shape:
-            self._shrunk, self._difference, self._change, self._moved, self.standing = (
-                shrunk,
-                0.0,
-                None,
-                0,
-                None,
-            )
+            self._shrunk, self._difference = shrunk, 0.0
             return "new"
         is_exposed = (
             abs(float(np.log((np.median(shrunk) + 1.0) / (np.median(before) + 1.0))))
@@ -111,27 +94,7 @@ class ImageGate:
         if difference < min(largest, _LARGEST_COPY * _REPEAT_DIFFERENCE) and self.was_moving:
             return "repeated"
         self._shrunk, self._difference = shrunk, difference
-        if self.was_moving:
-            self._moved += 1
-            change = np.abs(shrunk - before)
-            mean = change if self._change is None else self._change
-            self._change = mean + (change - mean) / np.float32(min(self._moved, _REMEMBERED_IMAGES))
-            if self._moved % _STANDING_IMAGES == 0:
-                self.standing = _standing(self._change, shrunk)
         return "new"
-
-
-def _standing(change: _Layer, shrunk: _Layer) -> Mask | None:
-    """The pixels ``(h, w)`` that hardly change while most others do, in pieces of at least three by three.
-
-    The pixels beside these belong to them: corners there are seen with a part of both.
-    """
-    if np.median(change) < _MOVING_GREY:
-        return None
-    few = ((change < _STANDING_GREY) & (shrunk < _BRIGHT_GREY)).astype(np.uint8)
-    piece = np.ones((3, 3), np.uint8)
-    pieces = cv2.dilate(cv2.morphologyEx(few, cv2.MORPH_OPEN, piece), piece)
-    return pieces.astype(bool) if pieces.any() else None
 
 
 def _shrunk(grey: Grey) -> _Layer:

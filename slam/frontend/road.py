@@ -89,16 +89,12 @@ class RoadHomography:
         """Prepare for the first step."""
         self._intrinsics = intrinsics
         self._top_row = int(np.clip(np.floor(intrinsics.cy), 0, intrinsics.height - 1))
-        self._standing: Mask | None = None
+        self._fixed: Mask | None = None
         self._strips = self._visible(None)
         self._directions: tuple[FloatArray, ...] = ()  # of motion, of the last steps
 
     def measure(
-        self,
-        previous: Frame,
-        current: Frame,
-        T_previous_current: FloatArray,
-        standing: Mask | None = None,
+        self, previous: Frame, current: Frame, T_previous_current: FloatArray
     ) -> RoadStep | Failed:
         """Measure the length of a step whose rotation and direction are known.
 
@@ -106,11 +102,9 @@ class RoadHomography:
             previous: the earlier frame, at the size of the intrinsics.
             current: the later frame.
             T_previous_current: its pose in the earlier camera, of any length but zero.
-            standing: pixels ``(h, w)`` of images of any size that do not show the world; None where
-                all do.
         """
-        if standing is not self._standing:
-            self._standing, self._strips = standing, self._visible(standing)
+        if current.fixed is not self._fixed:
+            self._fixed, self._strips = current.fixed, self._visible(current.fixed)
         T_unit = T_previous_current.copy()
         T_unit[:3, 3] /= np.linalg.norm(T_unit[:3, 3])
         self._directions = (*self._directions, T_unit[:3, 3])[-_STEPS_KEPT:]
@@ -124,9 +118,9 @@ class RoadHomography:
         nearby = self._measured_on(near, previous, current, T_unit, expected)
         return nearby if isinstance(nearby, RoadStep) else measured
 
-    def _visible(self, standing: Mask | None) -> list[_Strip]:
+    def _visible(self, fixed: Mask | None) -> list[_Strip]:
         camera = self._intrinsics
-        hidden = np.zeros((1, 1), bool) if standing is None else standing
+        hidden = np.zeros((1, 1), bool) if fixed is None else fixed
         visible = ~resized_mask(hidden, camera.width, camera.height)[self._top_row :]
         return [_strip(camera, self._top_row, *shape, visible) for shape in _SHAPES]
 

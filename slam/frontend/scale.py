@@ -57,6 +57,9 @@ _RATIO_WIDENING = 1.5  # factor on the sigma of a ratio measured by triangulated
 # neighbours share
 _BESIDE_ROAD = 4.0
 _UNIT_WALK_SIGMA = 0.003  # sigma per step of the random walk of learned depth's scale
+# steps over which learned lengths are compared with those by points, and their usual difference
+_NOISE_STEPS, _USUAL_NOISE = 20, 0.08
+_MOST_NOISE_BESIDE_ROAD = 2.0  # of learned lengths that a length by the road may contradict
 _UNIT_SIGMA = 0.2  # sigma of that scale by the learned ground plane
 _ACCELERATION_SIGMA = 3.0  # of a vehicle, in camera heights: 5 m/s2 at 1.65 m
 _SPEED_STEPS = 11  # window over which the speed is averaged that a change is compared with
@@ -160,9 +163,8 @@ def find_scale(
     evidence = gather_evidence(steps, motions, absolute, prior_unit, unit)
     if not isinstance(by_planes, Failed):
         # a car ahead taken for the road for seconds would outweigh all other measurements
-        evidence.absolute[
-            np.abs(evidence.absolute - evidence.learned) > np.log(_MAX_CONTRADICTION)
-        ] = np.nan
+        most = np.log(_MAX_CONTRADICTION) * min(evidence.learned_noise(), _MOST_NOISE_BESIDE_ROAD)
+        evidence.absolute[np.abs(evidence.absolute - evidence.learned) > most] = np.nan
     solved = solve_lengths(evidence)
     row_at = np.searchsorted([first for first, _ in steps], np.arange(frames), side="right") - 1
     per_frame = prior_unit * solved.unit_correction[row_at]
@@ -392,6 +394,21 @@ class StepEvidence:
     steady: FloatArray
     steady_sigma: FloatArray
 
+    def learned_noise(self) -> float:
+        """How much more learned lengths err than on the roads that the network knows, at least 1.
+
+        By how they change against the lengths that points give, over some steps.
+        """
+        change = np.concatenate([[0.0], np.diff(self.learned) - self.ratio[1:]])
+        is_known = np.isfinite(change)
+        summed = np.cumsum(np.where(is_known, change, 0.0))
+        gaps = np.cumsum(~is_known)
+        whole = gaps[_NOISE_STEPS:] == gaps[:-_NOISE_STEPS]
+        over_steps = (summed[_NOISE_STEPS:] - summed[:-_NOISE_STEPS])[whole]
+        if len(over_steps) < _NOISE_STEPS:
+            return 1.0
+        return max(float(np.sqrt(np.mean(over_steps**2))) / _USUAL_NOISE, 1.0)
+
     @classmethod
     def empty(cls, steps: int) -> StepEvidence:
         """Without a measurement."""
@@ -458,16 +475,18 @@ def solve_lengths(evidence: StepEvidence) -> StepLengths:
     steps = len(evidence.learned)
     lengths, units = 2 * np.arange(steps), 2 * np.arange(steps) + 1
     ratio_sigma = np.hypot(_RATIO_WIDENING * evidence.ratio_sigma, _RATIO_SIGMA)
-    learned_sigma = _LEARNED_SIGMA * np.where(np.isfinite(evidence.absolute), _BESIDE_ROAD, 1.0)
+    noise = evidence.learned_noise()
+    learned_sigma = noise * _LEARNED_SIGMA
+    beside_road = np.where(np.isfinite(evidence.absolute), _BESIDE_ROAD, 1.0)
     ones = np.ones(steps)
     zero = np.full(steps, 2 * steps)  # behind the last state
     # state[plus] - state[minus] = value, with a sigma: plus, minus, value, sigma
     parts = [
         (lengths[1:], lengths[:-1], evidence.ratio[1:], ratio_sigma[1:]),
         (lengths, zero, evidence.absolute, evidence.absolute_sigma),
-        (lengths, units, evidence.learned, learned_sigma),
+        (lengths, units, evidence.learned, learned_sigma * beside_road),
         (lengths[1:], lengths[:-1], evidence.steady[1:], evidence.steady_sigma[1:]),
-        (units[1:], units[:-1], 0.0 * ones[1:], _UNIT_WALK_SIGMA * ones[1:]),
+        (units[1:], units[:-1], 0.0 * ones[1:], noise * _UNIT_WALK_SIGMA * ones[1:]),
         # one prior on the unit of the whole drive, divided among its steps
         (units, zero, 0.0 * ones, _UNIT_SIGMA * np.sqrt(steps) * ones),
     ]
@@ -494,7 +513,7 @@ def solve_lengths(evidence: StepEvidence) -> StepLengths:
         _CORRELATED_WIDENING * sigmas * np.sqrt((1.0 + correlations) / (1.0 - correlations))
     )
     sigmas, correlated_sigmas = of_measured * sigmas, of_measured * correlated_sigmas
-    by_learned = (evidence.learned + log_unit - log_length) / _LEARNED_SIGMA
+    by_learned = (evidence.learned + log_unit - log_length) / learned_sigma
     by_speed = (np.diff(log_length, prepend=np.nan) - evidence.steady) / (
         evidence.steady_sigma + _LENGTH_SIGMA
     )

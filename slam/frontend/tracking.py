@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import DepthMap, Frame, Grey, Intrinsics, Mask, nearest, resized_mask
+from slam.frames import DepthMap, Frame, Grey, Intrinsics, resized_mask
 from slam.geometry.multiview import UnitRelativePose
 from slam.geometry.se3 import FloatArray, invert
 
@@ -136,11 +136,7 @@ def are_inside(pixels: Pixels, shape: tuple[int, ...]) -> NDArray[np.bool_]:
 
 
 def new_corners(
-    grey: Grey,
-    taken: Pixels,
-    count: int,
-    texture: Texture = KEYFRAME_CORNERS,
-    hidden: Mask | None = None,
+    frame: Frame, taken: Pixels, count: int, texture: Texture = KEYFRAME_CORNERS
 ) -> Pixels:
     """Up to ``count`` Shi-Tomasi corners ``(M, 2)``, apart from each other and from those taken.
 
@@ -148,17 +144,17 @@ def new_corners(
     among them: one thing that is all texture would have them all, be it the world or not.
 
     Args:
-        grey: ``(H, W)``.
+        frame: without what is fixed to the camera, where no corner is wanted.
         taken: corners ``(K, 2)`` in the image.
         count: of new corners.
         texture: what a corner is.
-        hidden: where no corner is wanted ``(h, w)``, in any size.
     """
     if count <= 0:
         return np.zeros((0, 2), np.float32)
+    grey = frame.grey
     free = _away_from(taken, int(texture.spacing_px), grey.shape)
-    if hidden is not None:
-        free[resized_mask(hidden, *grey.shape[::-1])] = 0
+    if frame.fixed is not None:
+        free[resized_mask(frame.fixed, *grey.shape[::-1])] = 0
     tiles, ranks = [np.zeros((0, 2), np.float32)], [np.zeros(0, np.int64)]
     for top, bottom in pairwise(np.linspace(0, grey.shape[0], _TILES[0] + 1).astype(int)):
         for left, right in pairwise(np.linspace(0, grey.shape[1], _TILES[1] + 1).astype(int)):
@@ -221,11 +217,7 @@ class CornerTracker:
         self._next_track_id = 0
 
     def track(
-        self,
-        previous: Frame,
-        current: Frame,
-        predicted_flow: PredictedFlow | None = None,
-        standing: Mask | None = None,
+        self, previous: Frame, current: Frame, predicted_flow: PredictedFlow | None = None
     ) -> Tracks:
         """Corners of ``previous`` tracked to ``current``.
 
@@ -233,17 +225,14 @@ class CornerTracker:
             previous: the frame before.
             current: the later frame.
             predicted_flow: between them; None where nothing predicts it.
-            standing: pixels ``(h, w)`` of images of any size that do not show the world; None where
-                all do.
         """
         if previous.index not in self._corners:
-            self._fill(previous, np.zeros((0, 2), np.float32), np.zeros(0, np.int64), standing)
+            self._fill(previous, np.zeros((0, 2), np.float32), np.zeros(0, np.int64))
         pixels, track_ids = self._corners[previous.index]
         forward, kept = _tracked(previous.grey, current.grey, pixels, predicted_flow)
-        if standing is not None:
-            kept &= ~nearest(resized_mask(standing, *current.grey.shape[::-1]), forward)
+        kept &= ~current.is_fixed(forward)
         if current.index not in self._corners:
-            self._fill(current, forward[kept], track_ids[kept], standing)
+            self._fill(current, forward[kept], track_ids[kept])
         before, now = pixels[kept].astype(np.float64), forward[kept].astype(np.float64)
         return Tracks(before, now, track_ids[kept], len(kept))
 
@@ -277,11 +266,9 @@ class CornerTracker:
 
         return find
 
-    def _fill(
-        self, frame: Frame, pixels: Pixels, track_ids: NDArray[np.int64], standing: Mask | None
-    ) -> None:
+    def _fill(self, frame: Frame, pixels: Pixels, track_ids: NDArray[np.int64]) -> None:
         """Keep the corners tracked to a frame, and new ones up to the largest number."""
-        fresh = new_corners(frame.grey, pixels, MAX_CORNERS - len(pixels), STEP_CORNERS, standing)
+        fresh = new_corners(frame, pixels, MAX_CORNERS - len(pixels), STEP_CORNERS)
         new_ids = self._next_track_id + np.arange(len(fresh))
         self._corners[frame.index] = (
             np.concatenate([pixels, fresh]),

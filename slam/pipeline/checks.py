@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 
 from slam.config.sections import SlamConfig
-from slam.frames import Sequence, runs
+from slam.frames import Mask, Sequence, runs
 from slam.frontend.drive import DOUBLED, Drive, named
 from slam.frontend.image_gate import ImageGate
 from slam.frontend.lidar_odometry import has_scans
@@ -76,7 +76,7 @@ def require_possible(
         known_frames(config.scale, sequence.stamps)
 
 
-def warn_of_images(gate: ImageGate) -> None:
+def warn_of_images(gate: ImageGate, fixed: Mask | None) -> None:
     """Warn of an exposure that rolls, and of a part of the image that does not show the world."""
     if gate.compared >= _LEAST_COMPARED and gate.exposed > _ROLLING_EXPOSURE * gate.compared:
         logger.warning(
@@ -85,11 +85,11 @@ def warn_of_images(gate: ImageGate) -> None:
             gate.exposed,
             gate.compared,
         )
-    if gate.standing is not None and gate.standing.mean() > _LEAST_STANDING:
+    if fixed is not None and fixed.mean() > _LEAST_STANDING:
         logger.warning(
             "%.0f %% of the image stand still while the camera moves (bars, a logo, the bonnet): no corner, depth or "
             "road is taken from there",
-            100 * gate.standing.mean(),
+            100 * fixed.mean(),
         )
 
 

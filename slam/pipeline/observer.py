@@ -6,7 +6,7 @@ import logging
 import math
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Self
 
@@ -14,17 +14,9 @@ import numpy as np
 
 from erfsfm.common.errors import OneLineError, explained, shows_traceback
 from slam.config.sections import SlamConfig
-from slam.frames import (
-    DepthMap,
-    Ends,
-    Frame,
-    Intrinsics,
-    Mask,
-    Predictor,
-    SnippetPoses,
-    resized_mask,
-)
+from slam.frames import DepthMap, Ends, Frame, Intrinsics, Predictor, SnippetPoses, resized_mask
 from slam.frontend.drive import Drive, Keyframe
+from slam.frontend.fixed_mask import FixedMask
 from slam.frontend.ground_plane import GroundPlaneFitter
 from slam.frontend.image_gate import ImageGate, Verdict
 from slam.frontend.road import RoadHomography, RoadStep
@@ -51,7 +43,7 @@ _LOOP_STRIDE = 4
 
 @dataclass
 class FrameInWork:
-    """A frame, what the networks were asked of it (None: nothing), and its pixels ``standing`` that show no world.
+    """A frame, what the networks were asked of it (None: nothing).
 
     Its ``depth`` ``(H, W)`` and the camera's ``height``, unscaled, are None until they are known.
     """
@@ -59,7 +51,6 @@ class FrameInWork:
     frame: Frame
     prediction: Future[DepthMap] | None
     snippet: Future[SnippetPoses] | None
-    standing: Mask | None
     depth: DepthMap | None = None
     height: float | None = None
 
@@ -106,6 +97,7 @@ class Observer:
         self._predictor, self._config, self._stopwatch = predictor, config, stopwatch
         self.drive = Drive()  # the measurements so far
         self.gate = ImageGate()
+        self.fixed = FixedMask()
         self._odometry = VisualOdometry(intrinsics, seed)
         self.keyframes = KeyframeTracking(
             config.keyframes, config.loops, intrinsics, seed, camera_height_m, self._ask_depth
@@ -154,11 +146,14 @@ class Observer:
             self._leave_out(index, str(frame))
             return
         self._unread = 0
+        frame = replace(frame, fixed=self.fixed.mask)
         with self._stopwatch.stage("read"):
             verdict: Verdict = self.gate.check(frame) if self._config.gaps.enabled else "new"
         if isinstance(verdict, Failed):
             self._leave_out(index, verdict.reason)
             return
+        if verdict == "new":
+            self.fixed.follow(frame.grey)
         asked = self._ask_networks(frame)
         try:
             self._measure_pending()
@@ -228,7 +223,7 @@ class Observer:
         wants_snippet = len(self._snippet_frames) > sources and (
             is_first or is_dense or index % sources == 0
         )
-        asked = FrameInWork(frame, None, None, self.gate.standing)
+        asked = FrameInWork(frame, None, None)
         if wants_depth:
             self._depth_index, asked.prediction = index, self._predict(frame)
         if wants_snippet:
@@ -307,9 +302,7 @@ class Observer:
         if step is not None and previous is not None:
             T_previous_current = step.relative_pose.T_from_to
             images = previous.frame, current.frame
-            measured = self._beside.submit(
-                self._road.measure, *images, T_previous_current, current.standing
-            )
+            measured = self._beside.submit(self._road.measure, *images, T_previous_current)
             self._tasks.append(Task("road", measured, partial(self._keep_road, step.ends)))
         if current.prediction is not None:
             self._tasks.append(
@@ -321,10 +314,8 @@ class Observer:
     def _learn(self, current: FrameInWork, depth: DepthMap) -> None:
         """Everything that the depth ``(H, W)`` of a frame gives."""
         frame, error = current.frame, self._odometry.depth_error
-        if current.standing is not None:
-            depth = np.where(
-                resized_mask(current.standing, *depth.shape[::-1]), np.float32(0), depth
-            )
+        if frame.fixed is not None:
+            depth = np.where(resized_mask(frame.fixed, *depth.shape[::-1]), np.float32(0), depth)
         with self._stopwatch.stage("road"):
             self.drive.roads[frame.index] = road = self._plane.fit(depth, error)
         self.keyframes.learn(frame, depth)
@@ -363,9 +354,7 @@ class Observer:
         if previous is None or not wanted:
             return None
         depth = self._depth_of(previous)
-        measured = self._odometry.measure(
-            previous.frame, current.frame, depth, previous.height, current.standing
-        )
+        measured = self._odometry.measure(previous.frame, current.frame, depth, previous.height)
         if isinstance(measured, Motion) and not is_se3(measured.relative_pose.T_from_to):
             measured = Failed(_NO_POSE)
         if isinstance(measured, Failed):

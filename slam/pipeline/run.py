@@ -9,6 +9,8 @@ from dataclasses import replace
 from functools import cached_property, partial
 from threading import Event
 
+import numpy as np
+
 from erfsfm.common.processes import read_ahead
 from erfsfm.common.progress import Progress, silent
 from erfsfm.common.signals import calling_on_signals
@@ -23,6 +25,7 @@ from slam.frontend.agreement import Agreement
 from slam.frontend.completion import complete_drive
 from slam.frontend.drive import Drive
 from slam.frontend.factors import chain_odometry, chain_raw, make_factors
+from slam.frontend.fixed_mask import FixedMask
 from slam.frontend.gps import GpsFixes, Location
 from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.lidar_odometry import LIDAR_SOURCE, LidarPath, lidar_path, usable_steps
@@ -51,6 +54,8 @@ from slam.runtime.stopwatch import Stopwatch
 from slam.sequences.recording import RecordedSequence
 
 logger = logging.getLogger(__name__)
+# images by which the part that is fixed to the camera is learned before the first step, and the frames they are from
+_IMAGES_AHEAD, _LOOKED_AHEAD = 60, 450
 
 
 class Recorder:
@@ -228,6 +233,8 @@ class SlamPipeline:
         total = len(self.sequence)
         ahead = read_ahead(partial(read_frame, self.sequence), range(total))
         with self.observer() as observer, closing(ahead) as read:
+            if frames is None:
+                self._look_ahead(observer.fixed)
             for index, frame in enumerate(self._watch.each("read", frames or read)):
                 observer.add(index, frame)
                 recorder.frame(observer)
@@ -235,8 +242,17 @@ class SlamPipeline:
                 if self._interrupted.is_set():
                     break
             measured = observer.measured()
-            warn_of_images(observer.gate)
+            warn_of_images(observer.gate, observer.fixed.mask)
             return measured
+
+    def _look_ahead(self, fixed: FixedMask) -> None:
+        """Learn what is fixed to the camera from images of the first minute, before it spoils the first steps."""
+        last = min(len(self.sequence), _LOOKED_AHEAD) - 1
+        with self._watch.stage("read"):
+            for index in np.unique(np.linspace(0, last, _IMAGES_AHEAD).astype(int)).tolist():
+                frame = read_frame(self.sequence, index)
+                if isinstance(frame, Frame):
+                    fixed.look_at(frame.grey)
 
     def _leave_out_unseen(self, observed: Drive) -> None:
         """After an interrupted pass the sequence is what was seen."""

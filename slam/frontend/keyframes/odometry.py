@@ -122,7 +122,7 @@ class KeyframeOdometry:
         # one that begins may be lost at once
         if self._relocaliser is None or self._relocaliser.local is not lost:
             self._relocaliser = Relocaliser(lost, self._intrinsics, self._seed)
-        corners = new_corners(frame.grey, _NOTHING[1], _MAX_CORNERS)
+        corners = new_corners(frame, _NOTHING[1], _MAX_CORNERS)
         unknown = np.full((len(corners), 3), np.nan, np.float32)
         found = self._relocaliser.locate(
             View(frame.index, corners, describe(frame.grey, corners), unknown)
@@ -220,7 +220,7 @@ class KeyframeOdometry:
             guesses = turned(guesses, turn.R_now_before, self._intrinsics)
         corners = keyframe.places[rows].astype(np.float32)
         tracked, kept = track(keyframe.grey, frame.grey, corners, KEYFRAME_SEARCH, guesses)
-        kept &= are_inside(tracked, frame.grey.shape)
+        kept &= are_inside(tracked, frame.grey.shape) & ~frame.is_fixed(tracked)
         shift = np.zeros(2, np.float32)
         if kept.any():
             shift = np.median(tracked[kept] - guesses[kept], axis=0)
@@ -323,7 +323,7 @@ class KeyframeOdometry:
             again, reprojected = segment.found_again(image, track_ids)
             track_ids = np.concatenate([track_ids, again])
             pixels = np.concatenate([pixels, reprojected])
-        fresh = new_corners(frame.grey, pixels, _MAX_CORNERS - len(pixels))
+        fresh = new_corners(frame, pixels, _MAX_CORNERS - len(pixels))
         track_ids = np.concatenate([track_ids, segment.new_tracks(len(fresh))])
         pixels = np.concatenate([pixels, fresh])
         order = np.argsort(track_ids)

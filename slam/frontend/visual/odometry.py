@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -26,7 +26,6 @@ from slam.frames import (
     Frame,
     Image,
     Intrinsics,
-    Mask,
     RelativePose,
     nearest_depth,
     resized_depth,
@@ -75,6 +74,8 @@ _REPROJECTION_PX = 2.0  # largest reprojection error of a PnP inlier, pixels
 # largest deviation of a corner on the road from the camera's height, in camera heights
 _ROAD_TOLERANCE = 0.2
 _STILL_FLOW_PX = 0.3  # median optical flow below which the camera stands still, pixels
+_NEAR_SLOPE = 0.05  # of a ray below the axis; the ground there is within 20 camera heights
+_LEAST_SHARED = 0.25  # of the near corners: what votes on them without those that passed by
 _MOST_STILL_FLOW_PX = 1.0  # of a corner of the world before a camera that stands still, pixels
 _MIN_PARALLAX_PX = 0.8  # least median optical flow that remains after rotation is removed, pixels
 _MIN_POINT_PARALLAX_PX = 2.0  # least parallax of a point used for step lengths, pixels
@@ -122,7 +123,6 @@ class VisualOdometry:
         current: Frame,
         depth_previous_unscaled: DepthMap,
         height_unscaled: float | None = None,
-        standing: Mask | None = None,
     ) -> Motion | Failed:
         """Measure the motion between two frames, the next two of the sequence or with others left out between them.
 
@@ -132,8 +132,6 @@ class VisualOdometry:
             depth_previous_unscaled: learned z-depth ``(H, W)`` of the earlier frame.
             height_unscaled: camera height in the same unit; where known, depths of more than
                 30 times as much are not trusted.
-            standing: pixels ``(h, w)`` that do not show the world, of images of any size; None
-                where all do.
         """
         previous, current = self._reduced(previous), self._reduced(current)
         depth_previous_unscaled = self._reduced_depth(depth_previous_unscaled)
@@ -144,7 +142,7 @@ class VisualOdometry:
             flow = PredictedFlow.of(
                 last.relative_pose.T_from_to, depth_previous_unscaled, self._intrinsics
             )
-        tracks = self._tracker.track(previous, current, flow, standing)
+        tracks = self._tracker.track(previous, current, flow)
         if len(tracks) < MIN_INLIERS:
             measured: Motion | Failed = Failed(f"only {len(tracks)} corners could be tracked")
         else:
@@ -153,8 +151,9 @@ class VisualOdometry:
             ends, votes = (previous.index, current.index), np.isin(tracks.track_ids, self._fitted)
             if votes.sum() < MIN_INLIERS:  # few are left that fitted the last motion
                 votes[:] = True
+            seconds = current.stamp - previous.stamp
             measured = (
-                self._still(ends, tracks, votes, depth)
+                self._still(ends, seconds, tracks, votes, depth)
                 or self._by_essential((previous, current), tracks, votes, learned, height_unscaled)
                 or self._by_points(ends, tracks, votes, depth)
             )
@@ -230,11 +229,25 @@ class VisualOdometry:
         return Matches(rays_previous, rays_current, depth, sigma, on_road, weights, votes, focal_px)
 
     def _still(
-        self, ends: Ends, tracks: Tracks, votes: NDArray[np.bool_], depth: FloatArray
+        self,
+        ends: Ends,
+        seconds: float,
+        tracks: Tracks,
+        votes: NDArray[np.bool_],
+        depth: FloatArray,
     ) -> Motion | None:
+        """No motion, None where near corners move: hills and gantries far ahead stand at any speed.
+
+        Near are corners below the axis, for the ground bounds their distance.
+        """
         flows = np.linalg.norm(tracks.current - tracks.previous, axis=1)
+        near = self._intrinsics.rays(tracks.previous)[:, 1] > _NEAR_SLOPE
+        if near.sum() >= MIN_INLIERS:
+            is_shared = (votes & near).sum() >= max(MIN_INLIERS, _LEAST_SHARED * near.sum())
+            votes = votes & near if is_shared else near
         flow = float(np.median(flows[votes]))
-        if flow >= _STILL_FLOW_PX or not np.isfinite(depth).any():
+        has_stopped = self._history.is_possible_speed(0.0, seconds) is not False
+        if flow >= _STILL_FLOW_PX or not (has_stopped and np.isfinite(depth).any()):
             return None
         self._fitted = tracks.track_ids[flows < _MOST_STILL_FLOW_PX]
         # a forward step of t moves a point at depth z and r pixels from the centre by r t / z
@@ -402,7 +415,7 @@ class VisualOdometry:
             image: Image = np.asarray(
                 cv2.resize(frame.image, self._size, interpolation=cv2.INTER_AREA), np.uint8
             )
-            return Frame(frame.index, frame.stamp, image)
+            return replace(frame, image=image)
 
         return (
             frame

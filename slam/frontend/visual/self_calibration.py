@@ -38,6 +38,10 @@ _PRIOR_SIGMA = 0.2
 _LEAST_SIGMA = 0.1
 _USUAL_SIGMA = 0.15
 _USUAL_FAR_SIGMA = 0.25
+# what moves along with the camera, as a car beside it, is triangulated far behind its place: that is
+# no error of learned depth
+_LEAST_RATIO = float(np.exp(_LOGARITHMS[0]))
+_SURE_SIGMAS = 2.0
 _FOCAL_STEP = 0.01  # of the logarithm, for its derivative
 _LEAST_SIGMA_PX = 1e-3
 # of the errors of corners, and of those that flow makes where a camera hardly turns
@@ -94,6 +98,8 @@ class DepthError:
             length: of the motion, in the unit of learned depth.
         """
         known = np.isfinite(learned)
+        farthest = nearness + _SURE_SIGMAS * sigma
+        known[known] = (farthest * learned)[known] > _LEAST_RATIO * length
         ratio = learned[known] * nearness[known] / length
         spread = learned[known] * sigma[known] / length
         weights = 1.0 / (1.0 + (spread / _USUAL_SIGMA) ** 2)

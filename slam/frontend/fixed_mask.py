@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Grey, Mask, slopes_of
+from slam.geometry.robust import running_median
 
 LEAST_IMAGES = 20  # before which nothing is said
 _REMEMBERED_IMAGES = 200  # a wiper comes to rest, a sticker falls
@@ -30,10 +31,16 @@ _TEXTURE = 1.2  # least mean gradient of a cell, grey levels a pixel: noise has 
 _EDGE = 0.8  # least mean gradient at an edge, grey levels a pixel
 # the mean of the gradient over its mean length: at fixed edges, more where few images were seen
 _FIXED, _FIXED_OF_FEW = 0.55, 4.0
+_WORLD = 0.35  # and at most where the world passes
+# share of world below the edge of a bonnet, which reflects it; a reflection on the windscreen has more
+_PASSES = 0.6
+_SMOOTH = 0.04  # of the width, over which the outline of what is hidden is smoothed
 _TOWARDS_MIDDLE = 0.5  # cosine of the angle between a gradient and the direction to the middle
 _NEAR_MIDDLE = 0.06  # of the width, within which every direction may be that of the motion
 _GAP = 0.025  # of the width, over which fixed edges are joined
-_BROAD = 0.25  # of the side of the image: an edge that hides what is beyond it
+# least width of an edge that hides what is beyond it, of the side of the image: of a bonnet below, and
+# of bars on the right, above and on the left
+_BROAD = 0.18, 0.8, 0.8, 0.8
 _DEEPEST = 0.4  # of the side of the image that such an edge may hide
 _CHANGED = 0.002  # of the image: a mask that changes by less stays
 _MARGIN = np.ones((3, 3), np.uint8)  # corners beside a fixed pixel see a part of it
@@ -100,6 +107,7 @@ class FixedMask:
         least = _FIXED + _FIXED_OF_FEW / self._counted
         is_fixed = (mean > least * length) & (np.abs(inwards) > least * inwards_size)
         is_fixed &= (np.abs(inwards) > _TOWARDS_MIDDLE * mean) & (length > _EDGE)
+        world = (mean < _WORLD * length) & (length > _EDGE)
         edges = cv2.morphologyEx(
             is_fixed.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)
         )
@@ -108,23 +116,34 @@ class FixedMask:
             np.pad(edges, gap), cv2.MORPH_CLOSE, np.ones((gap, gap), np.uint8)
         )[gap:-gap, gap:-gap]
         fixed = joined.astype(np.bool_)
-        for turns in range(4):
-            fixed |= np.rot90(_below_broad_edges(np.rot90(joined, turns)), -turns)
+        for turns, least_width in enumerate(_BROAD):
+            turned = np.rot90(joined, turns), np.rot90(world, turns)
+            fixed |= np.rot90(_below_broad_edges(*turned, least_width), -turns)
         return cv2.dilate(fixed.view(np.uint8), _MARGIN).astype(np.bool_) if fixed.any() else None
 
 
-def _below_broad_edges(edges: NDArray[np.uint8]) -> Mask:
-    """Pixels ``(h, w)`` below broad fixed edges in the lower part of an image, down to the border."""
+def _below_broad_edges(edges: NDArray[np.uint8], world: Mask, least_width: float) -> Mask:
+    """Pixels ``(h, w)`` below broad fixed edges in the lower part of an image, down to the border.
+
+    Not below those of a reflection, through which the ``world`` ``(h, w)`` is seen to pass.
+    """
     _, parts, stats, _ = cv2.connectedComponentsWithStats(np.ascontiguousarray(edges))
-    is_broad = stats[:, cv2.CC_STAT_WIDTH] > _BROAD * edges.shape[1]
+    is_broad = stats[:, cv2.CC_STAT_WIDTH] > least_width * edges.shape[1]
     is_broad[0] = False  # what is no edge
     below = is_broad[parts]
     below[: round((1.0 - _DEEPEST) * len(below))] = False
+    rows = np.arange(len(below), 0, -1)
+    passes = np.cumsum(world[::-1], axis=0)[::-1] / rows[:, None]
+    below &= passes < _PASSES
     columns = np.flatnonzero(below.any(axis=0))
     if len(columns):
-        span = np.arange(columns[0], columns[-1] + 1)
+        # a bonnet reaches from side to side, also where its edge looks now darker, now brighter than the road
+        span = np.arange(edges.shape[1])
         top = np.interp(span, columns, below.argmax(axis=0)[columns])
-        below[:, span] = np.arange(len(below))[:, None] >= top
+        top = running_median(top, 2 * round(_SMOOTH * edges.shape[1]) + 1)
+        is_hidden = passes[top.astype(np.intp), span] < _PASSES
+        is_hidden[columns[0] : columns[-1] + 1] = True
+        below = is_hidden & (np.arange(len(edges))[:, None] >= top)
     return below
 
 

@@ -21,11 +21,11 @@ from slam.geometry.robust import running_median
 LEAST_IMAGES = 20  # before which nothing is said
 _REMEMBERED_IMAGES = 200  # a wiper comes to rest, a sticker falls
 _EVERY_FIRST, _EVERY = 2, 5  # image that is looked at, until there are enough, and then
-_WIDTH_PX = 320  # of the image that is looked at: captions are still legible
+_WIDTH_PX = 240  # of the image that is looked at: captions are still seen, noise hardly
 _LOCAL_PX = 3.0  # sigma of the blur that takes out what changes slowly, as the sky does
 _STRONGEST = 8.0  # grey levels a pixel: one lamp must not count more than many images
 _CELLS = 16, 9  # across and down
-_LEAST_MOVED = 0.5  # of the cells with texture, in an image that counts
+_LEAST_MOVED = 0.5  # of the columns of cells with texture, in an image that counts
 _MOVED = 0.8  # difference of two images over their mean gradient, about pixels
 _TEXTURE = 1.2  # least mean gradient of a cell, grey levels a pixel: noise has less
 _EDGE = 0.8  # least mean gradient at an edge, grey levels a pixel
@@ -98,8 +98,10 @@ class FixedMask:
             cv2.resize(each, _CELLS, interpolation=cv2.INTER_AREA) for each in (change, length)
         )
         is_asked = textures > _TEXTURE
-        has_moved = changes[is_asked] > _MOVED * textures[is_asked]
-        return len(has_moved) > 0 and bool(has_moved.mean() > _LEAST_MOVED)
+        has_moved = is_asked & (changes > _MOVED * textures)
+        columns = is_asked.any(axis=0)
+        moved_columns = 2 * has_moved.sum(axis=0) > is_asked.sum(axis=0)
+        return bool(moved_columns.sum() > _LEAST_MOVED * columns.sum())
 
     def _found(self) -> Mask | None:
         slope_x, slope_y, length, inwards, inwards_size = self._means

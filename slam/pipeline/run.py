@@ -25,7 +25,7 @@ from slam.frontend.agreement import Agreement
 from slam.frontend.completion import complete_drive
 from slam.frontend.drive import Drive
 from slam.frontend.factors import chain_odometry, chain_raw, make_factors
-from slam.frontend.fixed_mask import FixedMask
+from slam.frontend.fixed_mask import LEAST_IMAGES, FixedMask
 from slam.frontend.gps import GpsFixes, Location
 from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.lidar_odometry import LIDAR_SOURCE, LidarPath, lidar_path, usable_steps
@@ -233,7 +233,7 @@ class SlamPipeline:
         total = len(self.sequence)
         ahead = read_ahead(partial(read_frame, self.sequence), range(total))
         with self.observer() as observer, closing(ahead) as read:
-            if frames is None:
+            if frames is None and len(self.sequence) >= 2 * LEAST_IMAGES:
                 self._look_ahead(observer.fixed)
             for index, frame in enumerate(self._watch.each("read", frames or read)):
                 observer.add(index, frame)

@@ -130,6 +130,17 @@ def test_no_module_is_named_like_one_of_python_and_every_folder_is_a_package() -
     assert not list((ROOT / "tests").rglob("__init__.py"))
 
 
+def test_each_file_of_tests_mirrors_a_module() -> None:
+    tests = ROOT / "tests"
+    without_module = []
+    for part in (*PACKAGES, "tools"):
+        for path in sorted((tests / part).rglob("test_*.py")):
+            module = path.with_name(path.name.removeprefix("test_")).relative_to(tests)
+            if module.as_posix() not in SOURCES:
+                without_module.append(f"{path.relative_to(ROOT)}: there is no {module}")
+    assert not without_module, "\n".join(without_module)
+
+
 def test_the_package_shows_its_doors_alone() -> None:
     assert {name for name in dir(slam) if not name.startswith("__")} == {
         "RunFolder",

@@ -42,10 +42,9 @@ from erfsfm.evaluation.depth_protocols import many_view_protocol
 from erfsfm.inference import DepthPosePredictor, choose_device, has_bfloat16, learned_inverse_depth
 from erfsfm.model_record import find_weights, read_record
 from erfsfm.networks.lite0 import Lite0DepthNet
-from erfsfm.training.keeper import StepProgress, WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses
-from erfsfm.training.output_folder import MEASUREMENTS, OutputFolder
+from erfsfm.training.output_folder import MEASUREMENTS, OutputFolder, StepProgress, WeightKeeper
 
 logger = logging.getLogger(__name__)
 

@@ -16,8 +16,14 @@ from erfsfm.common.readers.numbering import in_order
 from erfsfm.common.readers.video import VideoFrames
 from slam.runtime.errors import SlamError, sequence_errors
 from slam.runtime.files import write_atomically
-from slam.sequences.board import Board, chosen_views, find_views
-from slam.sequences.calibration import Calibration, Model, fit_camera
+from slam.sequences.calibration import (
+    Board,
+    Calibration,
+    Model,
+    chosen_views,
+    find_views,
+    fit_camera,
+)
 from slam.sequences.camera_file import DEFAULT_FPS, Undistortion
 from slam.sequences.images import ImageFiles, ImageSource
 

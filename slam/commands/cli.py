@@ -404,7 +404,7 @@ def calibrate(
     Example: erfsfm-slam calibrate board.mp4 --board 9x6 --square-m 0.03 --output camera.yaml
     """
     from slam.commands.calibration import calibrate_camera
-    from slam.sequences.board import Board, parse_board
+    from slam.sequences.calibration import Board, parse_board
 
     wanted = Board(*parse_board(board), square_m, pattern, dictionary, marker_share)
     with progress_bar() as progress:

@@ -23,7 +23,7 @@ from slam.pipeline.observer import Observer
 from slam.pipeline.run import SlamPipeline
 from slam.prediction.assembly import open_prediction
 from slam.results.folder import RunFolder, check_output, run_log
-from slam.results.report.live_viewer import Viewer
+from slam.results.report.rerun import Viewer
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_extra
 from slam.sequences.camera_file import as_known, find_camera_file

@@ -22,8 +22,7 @@ from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.frames import Frame, Image, Intrinsics, View
 from slam.geometry.multiview import consensus, resect
 from slam.geometry.se3 import FloatArray, apply, invert
-from slam.loops.descriptors import hamming
-from slam.loops.features import FeatureExtractor
+from slam.loops.features import FeatureExtractor, hamming
 from slam.loops.places import Places, PlaceStructure
 from slam.loops.verification import OF_FRAMES, OF_KEYFRAMES, matches
 from slam.loops.vocabulary import PlaceIndex

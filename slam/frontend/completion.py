@@ -1,17 +1,80 @@
-"""A drive completed after its last frame: its gaps, rotations, road and segments."""
+"""A drive completed after its last frame: its gaps, rotations, road and segments.
+
+Segments are where it is cut, because no measurement relates what follows.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
-from slam.frames import TrackingEvent
-from slam.frontend.drive import Drive
+from slam.frames import Ends, TrackingEvent, runs
+from slam.frontend.drive import Drive, Segment
 from slam.frontend.gaps import interpolate_gaps
 from slam.frontend.keyframes.relative_poses import NO_MAPS, KeyframePoses
 from slam.frontend.road import with_slope
 from slam.frontend.rotations import smooth_rotations
-from slam.frontend.segments import find_cuts, find_segments
+
+_LONGEST_GAP = 30  # interpolated frames, after which the place is only guessed
+
+
+def find_cuts(
+    failures: Sequence[tuple[int, int, str]], measured: Collection[Ends], doubtful: Collection[int]
+) -> list[int]:
+    """Frames that show another place than the frame before: their step failed, the steps before and after did not.
+
+    Args:
+        failures: steps that image geometry could not measure, and why.
+        measured: steps that it measured.
+        doubtful: frames that are unusable or repeat the one before.
+    """
+    ends = set(measured)
+    crossed: set[int] = set()  # frames across whose beginning a longer step measures
+    for first, last in ends:
+        if last - first > 1:
+            crossed.update(range(first + 1, last + 1))
+    cuts = []
+    for first, last, _ in failures:
+        around = {first - 1, first, last, last + 1}
+        alone = last == first + 1 and (first - 1, first) in ends and (last, last + 1) in ends
+        if alone and around.isdisjoint(doubtful) and last not in crossed:
+            cuts.append(last)
+    return sorted(set(cuts))
+
+
+def find_segments(
+    count: int,
+    cuts: Collection[int],
+    interpolated: Mapping[int, str],
+    is_related: Callable[[int], bool],
+) -> list[Segment]:
+    """The segments of a drive, by its cuts and its long gaps.
+
+    Args:
+        count: frames of the drive.
+        cuts: frames that show another place than the frame before.
+        interpolated: frames of gaps, with the reason.
+        is_related: tells of a frame whether a map of keyframes relates the frames from it on to
+            those before.
+    """
+    between = [cut for cut in cuts if not is_related(cut)]
+    begins = {0: ""} | dict.fromkeys(between, "it shows another place than the frame before")
+    ends = {count - 1} | {cut - 1 for cut in between}
+    for first, last in runs(interpolated):
+        if (
+            last - first + 1 > _LONGEST_GAP
+            and first > 0
+            and last + 1 < count
+            and not is_related(last + 1)
+        ):
+            ends.add(first - 1)
+            begins[last + 1] = (
+                f"{last - first + 1} frames before it are interpolated: {interpolated[first]}"
+            )
+    return [
+        Segment(first, last, begins[first])
+        for first, last in zip(sorted(begins), sorted(ends), strict=True)
+    ]
 
 
 def complete_drive(

@@ -30,7 +30,7 @@ from slam.frontend.visual.motion import Motion, RelativeRotation, Steps
 from slam.frontend.visual.self_calibration import DepthError, FocalLength
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import Failed
-from slam.runtime.spill_file import SpilledArray, SpillFile
+from slam.runtime.memory import SpilledArray, SpillFile
 
 T = TypeVar("T")
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose, View
 from slam.geometry.multiview import consensus, resect
 from slam.geometry.se3 import FloatArray, apply, invert, make, rotation_angle
-from slam.loops.descriptors import hamming
+from slam.loops.features import hamming
 
 _RATIO = 0.85  # largest ratio of nearest to second nearest descriptor distance
 _RANSAC_ITERATIONS = 200  # RANSAC iterations of PnP

@@ -16,7 +16,7 @@ from scipy.sparse import csr_array
 from erfsfm.common.processes import side_by_side
 from slam.frames import Descriptors, View
 from slam.geometry.se3 import FloatArray
-from slam.loops.descriptors import hamming
+from slam.loops.features import hamming
 
 _TRAINING_DESCRIPTORS = 15_000
 _ROUNDS = 3

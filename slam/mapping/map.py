@@ -17,7 +17,7 @@ from slam.mapping.depth import MOST_RELATIVE_SIGMA, DepthFilters, KeyframeDepth
 from slam.mapping.submap import BLOCK_VOXELS, Fusion, SpilledSubmap, ViewChooser
 from slam.mapping.surface import MapSurface
 from slam.runtime.errors import EmptyMapError
-from slam.runtime.spill_file import SpillFile
+from slam.runtime.memory import SpillFile
 
 # of the memory: growing needs twice the blocks, and the rest of the map has its own
 _FUSION_SHARE = 0.25

@@ -21,7 +21,7 @@ from slam.frames import DepthMap, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, apply, invert, rotation_angle
 from slam.mapping.depth import DepthFilters, KeyframeDepth, sampled
 from slam.runtime.imports import import_open3d
-from slam.runtime.spill_file import SpilledArray
+from slam.runtime.memory import SpilledArray
 
 Keys = NDArray[np.int64]
 SpilledSubmap = dict[str, SpilledArray]  # the fields of a `Submap` on disk

@@ -35,7 +35,7 @@ from slam.mapping.submap import (
 )
 from slam.runtime.errors import EmptyMapError
 from slam.runtime.imports import import_open3d
-from slam.runtime.spill_file import SpilledArray, SpillFile
+from slam.runtime.memory import SpilledArray, SpillFile
 
 _LEAST_WEIGHT = 1.0  # observations of a voxel that becomes surface
 _LEAST_TRIANGLES = 300  # of a connected piece; smaller ones float

@@ -27,8 +27,7 @@ from slam.geometry.se3 import chain, is_se3
 from slam.loops.features import FeatureExtractor
 from slam.pipeline.front_end_choice import KeyframeTracking
 from slam.runtime.errors import Failed, MissingFrameError, SequenceError, SlamError
-from slam.runtime.memory import return_freed_memory
-from slam.runtime.spill_file import SpillFile
+from slam.runtime.memory import SpillFile, return_freed_memory
 from slam.runtime.stopwatch import Stopwatch
 
 logger = logging.getLogger(__name__)

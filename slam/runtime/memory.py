@@ -1,10 +1,22 @@
-"""Memory of the process: its peak, and what is given back."""
+"""Memory of the process: its peak, what is given back, and arrays spilled to a temporary file.
+
+Spilled arrays limit the memory of a long drive.
+"""
 
 from __future__ import annotations
 
 import ctypes
 import resource
 import sys
+import tempfile
+from dataclasses import dataclass
+from threading import Lock
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.runtime.errors import SlamError
 
 
 def peak_rss_mb() -> float:
@@ -17,3 +29,70 @@ def return_freed_memory() -> None:
     """Give memory back that glibc's heaps keep: of images and layers of many sizes about 120 kB a frame."""
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "malloc_trim"):
         libc.malloc_trim(0)
+
+
+class SpillFile:
+    """An unnamed temporary file, shared by threads; the operating system removes it when the process ends."""
+
+    def __init__(self, what: str = "keyframes") -> None:
+        """An empty file; ``what`` names its content in errors."""
+        self._what = what
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as this object
+        self._end = 0
+        self._lock = Lock()  # the file has one position, which every write and read moves
+
+    def put(self, array: NDArray[Any]) -> SpilledArray:
+        """Write an array.
+
+        Raises:
+            SlamError: the disk is full.
+        """
+        content = np.ascontiguousarray(array)
+        try:
+            with self._lock:
+                start = self._end
+                self._file.seek(start)
+                self._file.write(content.data)
+                self._file.flush()
+                self._end += content.nbytes
+        except OSError as error:
+            raise SlamError(
+                f"{self._what} cannot be kept in {tempfile.gettempdir()} ({error.strerror or error}): "
+                "make room, set TMPDIR or switch fusion off (mapping.enabled=false)"
+            ) from error
+        return SpilledArray(self, start, content.shape, content.dtype)
+
+    def read(self, start: int, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+        """An array that was put at ``start``.
+
+        Args:
+            start: the first byte.
+            shape: of the array.
+            dtype: of its values.
+
+        Raises:
+            SlamError: the disk cannot be read.
+        """
+        count = int(np.prod(shape))
+        try:
+            with self._lock:
+                self._file.seek(start)
+                return np.fromfile(self._file, dtype, count).reshape(shape)
+        except (OSError, ValueError) as error:
+            raise SlamError(
+                f"{self._what} in {tempfile.gettempdir()} cannot be read ({error}): run again"
+            ) from error
+
+
+@dataclass(frozen=True)
+class SpilledArray:
+    """An array in a spill file: its place, shape and type."""
+
+    spill_file: SpillFile
+    start: int
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+    def read(self) -> NDArray[Any]:
+        """The array, as it was put."""
+        return self.spill_file.read(self.start, self.shape, self.dtype)

@@ -4,10 +4,18 @@ import numpy as np
 
 from slam.simulation import objects
 from slam.simulation.geometry import FloatArray, Material, Soup
-from slam.simulation.rectangle import Rectangle, corners_of, directed, grid_over
+from slam.simulation.options import StreetKind
 from slam.simulation.route import KERB
-from slam.simulation.shapes import ball, box, colour, frame_at
-from slam.simulation.variety import StreetKind
+from slam.simulation.shapes import (
+    Rectangle,
+    ball,
+    box,
+    colour,
+    corners_of,
+    directed,
+    frame_at,
+    grid_over,
+)
 
 
 def open_land(

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
-from slam.simulation.carried import Carried
-from slam.simulation.floor import Floor
+from slam.simulation.carried import Carried, Floor
 from slam.simulation.geometry import Float32Array, FloatArray, Material, Mesh, Moving
 from slam.simulation.interior import interior_of
 from slam.simulation.irradiance import irradiance_of

@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
 from slam.simulation.geometry import Bend, FloatArray, road_bend, town_bend
-from slam.simulation.variety import StreetKind, Variety
+from slam.simulation.options import StreetKind, Variety
 
 Node = tuple[int, int]
 BoolArray = NDArray[np.bool_]

@@ -16,12 +16,11 @@ from slam.geometry import se3
 from slam.runtime.imports import import_open3d
 from slam.simulation.geometry import Float32Array, FloatArray, Mesh, Moving
 from slam.simulation.objects import bonnet, car
-from slam.simulation.options import SimulationOptions
+from slam.simulation.options import SimulationOptions, draw_variety
 from slam.simulation.route import STEP, Route, plan_route
 from slam.simulation.shapes import frame_at
 from slam.simulation.texture import Texels, fractal
 from slam.simulation.town import build_town
-from slam.simulation.variety import draw_variety
 from slam.simulation.world import (
     SHUTTER,
     Hits,

@@ -5,9 +5,16 @@ import numpy as np
 from slam.simulation import objects
 from slam.simulation.geometry import Bend, FloatArray, Material, Mesh, Soup
 from slam.simulation.open_land import open_land
-from slam.simulation.rectangle import Rectangle, corners_of, directed, frame_along, grid_over
 from slam.simulation.route import KERB, StreetPlan
-from slam.simulation.shapes import colour, frame_at
+from slam.simulation.shapes import (
+    Rectangle,
+    colour,
+    corners_of,
+    directed,
+    frame_along,
+    frame_at,
+    grid_over,
+)
 
 LANE = 3.6  # width on a motorway, metres
 ROUNDING = 5.0  # radius of kerbs at corners, metres

@@ -40,7 +40,7 @@ from slam.frontend.keyframes.relocalisation import Relocaliser
 from slam.frontend.tracking import KEYFRAME_SEARCH, Pixels, are_inside, new_corners, track
 from slam.geometry.multiview import INLIER_PX, MIN_POINTS, Resection, parallax_px, resect
 from slam.geometry.se3 import FloatArray, apply, compose, invert, make
-from slam.loops.descriptors import describe
+from slam.loops.features import describe
 
 logger = logging.getLogger(__name__)
 

@@ -1,3 +1,5 @@
+"""The network that fuses depth, and its training."""
+
 from __future__ import annotations
 
 import json
@@ -11,8 +13,8 @@ import pytest
 import torch
 
 from erfsfm.cli import main
-from erfsfm.training.fusion import fusion_loss
-from erfsfm.training.fusion_net import FusionNet
+from erfsfm.mvs.fusion import CHANGE, CHANNELS
+from erfsfm.training.fusion import FusionNet, fusion_loss
 
 Cli = Callable[..., tuple[int, str, str]]
 
@@ -101,3 +103,15 @@ def test_a_network_is_trained_on_worlds_and_refines_a_run(
         ]
         < 0.5
     )
+
+
+def test_a_fresh_network_trusts_the_measurement_at_every_pixel() -> None:
+    evidence = torch.zeros(1, CHANNELS, 16, 24)
+    block = evidence[:, 4 * CHANGE : 4 * CHANGE + 4]
+    block[:] = torch.rand(block.shape)
+    change, log_sigma = FusionNet(CHANNELS, 4 * CHANGE).eval()(evidence)
+    measured = torch.nn.functional.pixel_shuffle(block, 2)[:, 0]
+    torch.testing.assert_close(
+        change / measured, torch.full_like(measured, torch.sigmoid(torch.tensor(3.0)).item())
+    )
+    assert log_sigma.shape == change.shape == (1, 32, 48)

@@ -32,8 +32,8 @@ from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.model_record import DepthInput, ModelRecord
-from erfsfm.training.keeper import licence_of
 from erfsfm.training.module import SelfSupervision, learning_rate_factor
+from erfsfm.training.output_folder import licence_of
 from erfsfm.training.run import train
 
 Small = dict[str, dict[str, object]]

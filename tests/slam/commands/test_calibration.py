@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from erfsfm.common.readers.camera_file import CameraFile, read_camera_file
 from slam.commands.cli import main
 from slam.frames import Intrinsics
-from slam.sequences.board import Board
+from slam.sequences.calibration import Board
 from slam.sequences.catalogue import open_sequence
 
 Call = Callable[..., tuple[int, str, str]]

@@ -1,11 +1,11 @@
-"""Features of the images of a simulated street."""
+"""Features of the images of a simulated street, and the distance of descriptors."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from slam.frames import Frame, Intrinsics
-from slam.loops.features import FeatureExtractor
+from slam.loops.features import FeatureExtractor, hamming
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 
@@ -27,3 +27,14 @@ def test_features_are_spread_and_bounded() -> None:
     assert view.pixels[:, 0].std() > 0.15 * SIZE[0]
     blank = extractor.view(Frame(4, 0.4, np.full((SIZE[1], SIZE[0], 3), 90, np.uint8)), depth)
     assert len(blank) == 0
+
+
+def place(rng: np.random.Generator) -> np.ndarray:
+    return rng.integers(0, 256, (80, 32), dtype=np.uint8)
+
+
+def test_hamming_counts_bits() -> None:
+    rng = np.random.default_rng(1)
+    first, second = place(rng), place(rng)[:50]
+    slow = np.unpackbits(first[:, None] ^ second[None], axis=2).sum(axis=2)
+    np.testing.assert_array_equal(hamming(first, second), slow)

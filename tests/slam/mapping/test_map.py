@@ -12,7 +12,7 @@ from slam.mapping.depth import KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_open3d
-from slam.runtime.spill_file import SpillFile
+from slam.runtime.memory import SpillFile
 
 CAMERA = Intrinsics(208, 64, 120.0, 120.0, 103.5, 31.5)
 V, U = np.mgrid[: CAMERA.height, : CAMERA.width]

@@ -13,7 +13,7 @@ from slam.frontend.drive import Drive, Keyframe
 from slam.mapping.depth import KeyframeDepth
 from slam.pipeline.estimate import keyframe_depths
 from slam.runtime.errors import Failed
-from slam.runtime.spill_file import SpillFile
+from slam.runtime.memory import SpillFile
 
 CAMERA = Intrinsics(64, 32, 50.0, 50.0, 31.5, 15.5)
 FRAMES = 6

@@ -3,9 +3,8 @@ import numpy as np
 import pytest
 
 from slam.geometry import se3
-from slam.simulation.options import SimulationOptions
+from slam.simulation.options import SimulationOptions, draw_variety
 from slam.simulation.street import SimulatedStreet
-from slam.simulation.variety import draw_variety
 
 SMALL = {"width": 208, "height": 64}
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slam.runtime.errors import SlamError
-from slam.runtime.spill_file import SpillFile
+from slam.runtime.memory import SpillFile
 
 
 def test_arrays_come_back_in_any_order() -> None:

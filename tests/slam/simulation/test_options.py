@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from slam.simulation.variety import draw_variety
+from slam.simulation.options import draw_variety
 
 
 def test_varieties_cover_streets_and_cameras() -> None:

@@ -17,7 +17,7 @@ UV ?= uv
 # Tests are of one thread each; a file's tests stay together, for they share what they prepare
 PYTEST := $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
 
-.PHONY: setup lock demo test quick test-all lint docs benchmark dist publish clean
+.PHONY: setup lock demo fast test quick test-all lint docs benchmark dist publish clean
 
 setup: $(READY)
 
@@ -41,6 +41,20 @@ lock:
 
 demo: setup
 	$(BIN)/erfsfm-slam run
+
+# What differs from main, committed or not, and the test files that mirror it
+MAIN ?= main
+CHANGED = $(filter %.py,$(shell git diff --name-only --diff-filter=d $(MAIN); git ls-files --others --exclude-standard))
+MIRRORS = $(wildcard $(filter tests/%,$(CHANGED)) \
+	$(foreach file,$(filter-out tests/%,$(CHANGED)),tests/$(dir $(file))test_$(notdir $(file))))
+
+# The inner loop: lint and the mirror tests of what differs from main
+fast: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check --quiet .
+	$(BIN)/python tools/house.py
+	$(if $(CHANGED),$(BIN)/mypy)
+	$(if $(MIRRORS),$(BIN)/python -m pytest -q -m 'not slow' $(filter tests/%,$(sort $(MIRRORS))))
 
 # mypy keeps one core busy for most of a minute, so the tests begin beside it
 test: setup

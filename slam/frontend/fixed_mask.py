@@ -11,6 +11,8 @@ image belongs to it.
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +23,7 @@ from slam.geometry.robust import running_median
 LEAST_IMAGES = 20  # before which nothing is said
 _REMEMBERED_IMAGES = 200  # a wiper comes to rest, a sticker falls
 _EVERY_FIRST, _EVERY = 2, 5  # image that is looked at, until there are enough, and then
-_WIDTH_PX = 240  # of the image that is looked at: captions are still seen, noise hardly
+_WIDTH_PX = 320  # of the image that is looked at, at most: captions are still seen, noise hardly
 _LOCAL_PX = 3.0  # sigma of the blur that takes out what changes slowly, as the sky does
 _STRONGEST = 8.0  # grey levels a pixel: one lamp must not count more than many images
 _CELLS = 16, 9  # across and down
@@ -151,7 +153,7 @@ def _below_broad_edges(edges: NDArray[np.uint8], world: Mask, least_width: float
 
 def _local(grey: Grey) -> _Layer:
     """The image in a smaller size, without what changes slowly over it."""
-    ratio = max(round(grey.shape[1] / _WIDTH_PX), 1)
+    ratio = math.ceil(grey.shape[1] / _WIDTH_PX)
     height, width = (max(side // ratio, 1) for side in grey.shape)
     whole = grey[: ratio * height, : ratio * width]
     small = np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)

@@ -271,9 +271,9 @@ def predictions(texture, steps, failing=()) -> dict[tuple[int, int], bool]:
 
     track = CornerTracker.track
 
-    def watched(self, previous, current, flow=None, standing=None):
+    def watched(self, previous, current, flow=None):
         predicted[previous.index, current.index] = flow is not None
-        return track(self, previous, current, flow, standing)
+        return track(self, previous, current, flow)
 
     odometry = VisualOdometry(CAMERA)
     with pytest.MonkeyPatch.context() as patch:

@@ -28,6 +28,6 @@ def test_features_are_spread_and_bounded() -> None:
     fixed = np.zeros((24, 78), bool)
     fixed[:, 39:] = True
     seen = extractor.view(Frame(3, 0.6, rendered.image, fixed), depth, height_m)
-    assert 50 < len(seen) < len(view) and seen.pixels[:, 0].max() < SIZE[0] / 2
+    assert len(seen) > 100 and seen.pixels[:, 0].max() < SIZE[0] / 2
     blank = extractor.view(Frame(4, 0.4, np.full((SIZE[1], SIZE[0], 3), 90, np.uint8)), depth)
     assert len(blank) == 0

@@ -35,7 +35,13 @@ from slam.prediction.depth_source import FrameNumbers
 from slam.results.estimate_metrics import estimate_metrics, lidar_trajectory, timing_of
 from slam.results.folder import RunFolder, RunLog, check_output, run_log
 from slam.results.metrics import MapMetrics, Metrics, Provenance
-from slam.results.report.page import DepthPictures, Picture, loop_pictures, write_report
+from slam.results.report.page import (
+    DepthPictures,
+    Picture,
+    fixed_pictures,
+    loop_pictures,
+    write_report,
+)
 from slam.results.report.rerun import write_rerun
 from slam.results.truth_errors import DepthQuality, map_errors
 from slam.runtime.errors import EmptyMapError, Failed, RunError, SlamError, attempt
@@ -223,8 +229,12 @@ class FolderRecorder(Recorder):
             if self._settings.output.report:
                 from slam.results.report.figures import map_view  # with Plotly
 
+                drive, fixed = estimate.drive, []
+                if drive.fixed is not None and drive.keyframes:
+                    image = drive.keyframes[len(drive.keyframes) // 2].image
+                    fixed = fixed_pictures(image, drive.fixed)
                 pictures = self._depths.pictures(), self._loop_pictures(estimate)
-                write_report(self.folder, *pictures, map_view(self.folder), metrics)
+                write_report(self.folder, *pictures, map_view(self.folder), metrics, fixed)
 
         self._progress("report", 0, 1)
         attempt("the report", reported)

@@ -16,6 +16,7 @@ from slam.frames import (
     Frame,
     Image,
     Intrinsics,
+    Mask,
     RelativePose,
     SnippetPoses,
     TrackingEvent,
@@ -101,7 +102,8 @@ class Drive:
         ``repeated`` frames with the image of the one before, ``moving`` those of them just before
         which the camera moved. ``depth_error`` is that of learned depth and ``focal_length`` the
         one that corners show, as the steps have them. ``maps`` are those of keyframes and
-        ``events`` what became of them; a drive measured by steps alone has none.
+        ``events`` what became of them; a drive measured by steps alone has none. ``fixed`` is the part of the
+        last image that is fixed to the camera.
 
     Added by `slam.frontend.completion.complete_drive`, which also leaves out views and keyframes of
     interpolated frames, fills ``snippets`` to one a target, and smooths the rotations of
@@ -124,6 +126,7 @@ class Drive:
     moving: list[int] = field(default_factory=list)
     depth_error: DepthError = field(default_factory=DepthError)
     focal_length: FocalLength = field(default_factory=FocalLength)
+    fixed: Mask | None = None
 
     trusted: list[SnippetPoses] = field(default_factory=list)
     interpolated: dict[int, str] = field(default_factory=dict)

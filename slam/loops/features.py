@@ -17,10 +17,10 @@ from slam.frames import (
     DepthMap,
     Descriptors,
     Frame,
-    Grey,
     Intrinsics,
     View,
     nearest_depth,
+    resized_mask,
     trusted_depth,
 )
 from slam.geometry.se3 import FloatArray
@@ -61,14 +61,17 @@ class FeatureExtractor:
             depth_unscaled: its learned z-depth ``(H, W)``.
             height_unscaled: camera height in the same unit (see `trusted_depth`).
         """
-        pixels, descriptors = self.corners(frame.grey)
+        pixels, descriptors = self.corners(frame)
         z = trusted_depth(nearest_depth(depth_unscaled, pixels), height_unscaled)
         points = self._intrinsics.rays(pixels) * z[:, None]
         return View(frame.index, pixels, descriptors, points.astype(np.float32))
 
-    def corners(self, grey: Grey) -> tuple[NDArray[np.float32], Descriptors]:
-        """Pixels ``(M, 2)`` and descriptors ``(M, 32)``."""
-        detected = self._orb.detect(grey, None)
+    def corners(self, frame: Frame) -> tuple[NDArray[np.float32], Descriptors]:
+        """Pixels ``(M, 2)`` and descriptors ``(M, 32)`` of what is not fixed to the camera."""
+        grey, seen = frame.grey, None
+        if frame.fixed is not None:
+            seen = (~resized_mask(frame.fixed, *grey.shape[::-1])).view(np.uint8)
+        detected = self._orb.detect(grey, seen)
         pixels = np.array([k.pt for k in detected]).reshape(-1, 2)
         response = np.array([k.response for k in detected])
         column, row = (pixels // _CELL_PX).astype(int).T

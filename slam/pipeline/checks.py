@@ -18,7 +18,7 @@ logger = logging.getLogger(__name__)
 # real drives with automatic exposure have 0.13 at ten frames a second and 0.51 at two
 _ROLLING_EXPOSURE = 0.6
 _LEAST_COMPARED = 30
-_LEAST_STANDING = 0.02  # of the image
+_LEAST_STANDING, _MOST_STANDING = 0.02, 0.6  # of the image
 
 
 def require_possible(
@@ -90,6 +90,11 @@ def warn_of_images(gate: ImageGate, fixed: Mask | None) -> None:
             "%.0f %% of the image stand still while the camera moves (bars, a logo, the bonnet): no corner, depth or "
             "road is taken from there",
             100 * fixed.mean(),
+        )
+    if fixed is not None and fixed.mean() > _MOST_STANDING:
+        logger.warning(
+            "little of the world is left: mount the camera so that it sees more of the road, or give a mask in "
+            "camera.yaml if the part was found wrongly"
         )
 
 

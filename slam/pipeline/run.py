@@ -242,7 +242,7 @@ class SlamPipeline:
                 if self._interrupted.is_set():
                     break
             measured = observer.measured()
-            warn_of_images(observer.gate, observer.fixed.mask)
+            warn_of_images(observer.gate, measured.fixed)
             return measured
 
     def _look_ahead(self, fixed: FixedMask) -> None:

@@ -35,6 +35,9 @@ from slam.runtime.stopwatch import Stopwatch
 LEVELS = (50, 90, 95)  # per cent of the factors that the bounds of their stated noise hold
 _NO_TRUTH = Failed("the sequence has no true poses")
 _BY_MAPS = Failed("maps of keyframes give the poses, not steps from frame to frame")
+_NOTHING_FIXED = Failed(
+    "nothing was found that is fixed to the camera, or too few images moved to find it"
+)
 _NO_MAP_YET = Failed("the run ended before its map was whole")
 
 
@@ -108,6 +111,7 @@ def _sequence(result: Estimate, sequence: FrameSequence) -> records.SequenceMetr
         doubled=_stretches(dict.fromkeys(drive.doubled, DOUBLED)),
         unreadable_scans=_stretches(scans),
         segments=[records.Stretch(**asdict(segment)) for segment in drive.segments],
+        fixed_share=_NOTHING_FIXED if drive.fixed is None else float(drive.fixed.mean()),
     )
 
 

@@ -44,7 +44,10 @@ class Stretch(Record):
 
 
 class SequenceMetrics(Record):
-    """Size of the sequence and its true length; interpolated (``bridged``) and doubled frames, segments."""
+    """Size of the sequence and its true length; interpolated (``bridged``) and doubled frames, segments.
+
+    ``fixed_share`` is the part of the image that is fixed to the camera.
+    """
 
     name: str | None = None
     frames: Count | None = None
@@ -55,6 +58,7 @@ class SequenceMetrics(Record):
     doubled: list[Stretch] | None = None
     unreadable_scans: list[Stretch] | None = None
     segments: list[Stretch] | None = None
+    fixed_share: float | None = None
 
 
 class Timing(Record):

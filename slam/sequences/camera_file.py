@@ -22,7 +22,8 @@ from erfsfm.common.config_tree import parse_yaml
 from erfsfm.common.errors import DataError, ErfsfmError
 from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile, camera_of, read_camera_file
-from slam.frames import DepthMap, Image, Intrinsics, sampled_depth
+from erfsfm.common.readers.images import read_image
+from slam.frames import DepthMap, Image, Intrinsics, Mask, sampled_depth
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
 from slam.sequences.images import Sized
@@ -32,6 +33,9 @@ logger = logging.getLogger(__name__)
 DEFAULT_FPS = 10.0
 _FOV = re.compile(r"fov=(?P<fov>\d+\.?\d*)(?:,fps=(?P<fps>\d+\.?\d*))?")
 _FOV_LIMITS_DEG = (3.0, 150.0)
+
+_OF_THE_MOUNTING = ("camera_height_m", "readout_ms", "mask")  # which no calibration knows
+_BLACK = 128  # grey levels of a mask below which a pixel shows what is fixed to the camera
 
 Keys = dict[str, Any]
 
@@ -72,7 +76,7 @@ def find_camera_file(
     Args:
         explicit: a ``camera.yaml``, or ``fov=DEGREES[,fps=RATE]``.
         folders: where a ``camera.yaml`` may lie; where there is a calibration of the recording's own, it gives the
-            height of the camera and its read-out alone.
+            height of the camera, its read-out and mask alone.
         wanted_by: what needs it, for the message.
         images: the images that it took, for a camera by its field of view.
         fps: their rate where known, for the same; 10 a second otherwise.
@@ -87,9 +91,7 @@ def find_camera_file(
     camera = None if own is None else own()
     found = beside(*folders, own=None if camera is None else camera.model_dump())
     if camera is not None and found is not None:
-        return camera.model_copy(
-            update={"camera_height_m": found.camera_height_m, "readout_ms": found.readout_ms}
-        )
+        return camera.model_copy(update={name: getattr(found, name) for name in _OF_THE_MOUNTING})
     camera = camera or found
     if camera is not None:
         return camera
@@ -419,3 +421,22 @@ def undistorted(camera: CameraFile) -> tuple[Intrinsics, Undistortion | None]:
         undistortion = Undistortion(camera)
         return undistortion.intrinsics, undistortion
     return replace(Intrinsics.of(camera.pinhole), readout_s=camera.readout_ms / 1e3), None
+
+
+def fixed_to(camera: CameraFile, undistortion: Undistortion | None) -> Mask | None:
+    """Where images ``(H, W)``, undistorted if their lens is distorted, show what is fixed to their camera, by its mask.
+
+    Raises:
+        DataError: the image of the mask is missing or broken, or has another size than the camera.
+    """
+    if camera.mask is None:
+        return None
+    image = read_image(Path(camera.mask))
+    height, width = image.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        raise DataError(
+            f"mask: {camera.mask} is {width}x{height}, its camera {camera.width}x{camera.height}: draw it on one of "
+            "its images"
+        )
+    image = image if undistortion is None else undistortion.apply(image)
+    return np.asarray(image[..., 0] < _BLACK)

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.numbering import NumberedFiles
 from slam.formats.rows import BadRows, in_seconds, number_or_nan, rows_of
-from slam.frames import Frame, Image, Intrinsics
+from slam.frames import Frame, Image, Intrinsics, Mask
 from slam.geometry.se3 import FloatArray, is_se3
 from slam.runtime.errors import SequenceError, SlamError, sequence_errors
-from slam.sequences.camera_file import Undistortion, require_size, undistorted
+from slam.sequences.camera_file import Undistortion, fixed_to, require_size, undistorted
 from slam.sequences.gps_track import FASTEST_M_S
 from slam.sequences.images import ImageFiles, ImageSource, ReadImages, too_long
 from slam.sequences.poses import known_poses, rebased
@@ -90,6 +90,7 @@ class RecordedSequence:
     distance_to_surface: Callable[[FloatArray], FloatArray] | None = None
     intrinsics: Intrinsics = field(init=False)
     undistortion: Undistortion | None = field(default=None, init=False)
+    fixed: Mask | None = field(default=None, init=False)  # (H, W), by the camera's own mask
     camera_height_m: float | None = field(init=False)
     reference: FloatArray | None = field(default=None, init=False)
     start: int = field(default=0, init=False)
@@ -104,6 +105,7 @@ class RecordedSequence:
         if isinstance(self.camera, CameraFile):
             require_size(self.images, self.camera, where)
             self.intrinsics, self.undistortion = undistorted(self.camera)
+            self.fixed = fixed_to(self.camera, self.undistortion)
             self.camera_height_m = self.camera.height_or(usual_height_m)
             self.depth_maps = self.depth_maps if self.undistortion is None else {}
         else:
@@ -172,7 +174,7 @@ class RecordedSequence:
             image = self.images.read(self.start + index)
         if self.undistortion is not None:
             image = self.undistortion.apply(image)
-        return Frame(index, float(self.stamps[index]), image)
+        return Frame(index, float(self.stamps[index]), image, self.fixed)
 
     def has_scan(self, index: int) -> bool:
         """Whether a LiDAR scan was taken with a frame."""

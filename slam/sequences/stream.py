@@ -28,7 +28,7 @@ from erfsfm.common.readers.images import (
 )
 from slam.frames import Frame, Image
 from slam.runtime.errors import SequenceError
-from slam.sequences.camera_file import DEFAULT_FPS, require_size, undistorted
+from slam.sequences.camera_file import DEFAULT_FPS, fixed_to, require_size, undistorted
 from slam.sequences.recording import GrowingSequence
 
 logger = logging.getLogger(__name__)
@@ -82,6 +82,7 @@ class StreamedSequence(GrowingSequence):
                 f"{name} does not wait while an image is measured: leave out --every-frame"
             )
         intrinsics, self._undistortion = undistorted(camera)
+        self._fixed = fixed_to(camera, self._undistortion)
         super().__init__(intrinsics, camera.height_or(None), name)
         self.arrived_s: dict[int, float] = {}
         self.dropped, self.ended = 0, ""
@@ -101,7 +102,7 @@ class StreamedSequence(GrowingSequence):
             self.arrived_s = {k: v for k, v in self.arrived_s.items() if k >= index - 2} | {
                 index: at_s
             }
-            yield Frame(index, stamp, image)
+            yield Frame(index, stamp, image, self._fixed)
 
     def stop(self) -> None:
         """End after the images that wait."""

@@ -59,6 +59,10 @@ class CameraFile(BaseModel):
     depth_per_metre: float | None = Field(
         default=None, gt=0, description="value of one metre in the maps of depth/"
     )
+    mask: str | None = Field(
+        default=None,
+        description="an image of the same size beside this file: white shows the world, black the bonnet or a caption",
+    )
     source: str | None = Field(default=None, description="a note on where the numbers come from")
 
     @model_validator(mode="after")
@@ -125,6 +129,8 @@ def read_camera_file(path: Path, own: Mapping[str, Any] | None = None) -> Camera
             name for name, item in CameraFile.model_fields.items() if item.is_required()
         )
         raise DataError(f"{path} holds no keys: a camera file needs {keys}")
+    if isinstance(content.get("mask"), str):
+        content["mask"] = str(path.parent / content["mask"])
     return camera_of({**(own or {}), **content}, str(path))
 
 

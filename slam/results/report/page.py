@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from erfsfm.common.readers.images import resize_image
 from slam.formats.trajectory import Trajectory
-from slam.frames import Image, Intrinsics
+from slam.frames import Image, Intrinsics, Mask, resized_mask
 from slam.loops.verification import Loop
 from slam.mapping.depth import KeyframeDepth
 from slam.results.folder import RunFolder
@@ -49,6 +49,7 @@ _TEMPLATES = Environment(
 )
 _EXAMPLES, _MOST_LOOPS, _MOST_LINES = 5, 6, 60
 _WIDTH_PX = 480
+_LEAST_FIXED, _RED = 0.02, (220, 30, 30)  # of the image; its colour there
 _LINES = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167), (213, 94, 0))
 
 
@@ -69,11 +70,12 @@ def write_report(
     loops: Sequence[Picture] = (),
     view: MapView | None = None,
     metrics: Metrics | None = None,
+    fixed: Sequence[Picture] = (),
 ) -> None:
     """Write ``report.html`` from the files of a run, also of a failed one, and what they do not hold.
 
-    ``depths`` are strips of images and their depth, ``loops`` pairs of images of accepted loops; without ``metrics``
-    those of the folder are read.
+    ``depths`` are strips of images and their depth, ``loops`` pairs of images of accepted loops, ``fixed`` shows the
+    part of the image that is fixed to the camera; without ``metrics`` those of the folder are read.
     """
     metrics = metrics or folder.metrics()
     said, errors = verdict(metrics), metrics.evaluated_errors()
@@ -98,6 +100,7 @@ def write_report(
         alignments=alignments_table(optimised) if not optimised.absent and not no_errors else None,
         no_errors=no_errors,
         depths=depths,
+        fixed=fixed,
         no_map=_absence(metrics, no_map),
         loop_pictures=loops,
         no_loops=_absence(metrics, metrics.loops.absent),
@@ -247,6 +250,16 @@ def loop_pictures(
                     )
                 )
     return found
+
+
+def fixed_pictures(image: Image, fixed: Mask) -> list[Picture]:
+    """An image ``(H, W, 3)`` with the part ``(h, w)`` of it that is fixed to the camera in red; none if it is small."""
+    if fixed.mean() < _LEAST_FIXED:
+        return []
+    image = narrowed(image, _WIDTH_PX)
+    red = resized_mask(fixed, *image.shape[1::-1])
+    image[red] = image[red] // 2 + np.array(_RED, np.uint8) // 2
+    return [_picture(image, f"{100 * fixed.mean():.0f} % of the image")]
 
 
 def _joined(first: Image, second: Image, ends: NDArray[np.floating]) -> Image:

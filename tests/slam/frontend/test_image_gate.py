@@ -39,8 +39,8 @@ def frames_of(images: list[Image]) -> list[Frame]:
     return [Frame(k, 0.1 * k, image) for k, image in enumerate(images)]
 
 
-def verdicts(images: list[Image], gate: ImageGate | None = None) -> list[str]:
-    gate = gate or ImageGate()
+def verdicts(images: list[Image]) -> list[str]:
+    gate = ImageGate()
     return [v.reason if isinstance(v, Failed) else v for v in map(gate.check, frames_of(images))]
 
 

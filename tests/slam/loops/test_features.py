@@ -25,6 +25,10 @@ def test_features_are_spread_and_bounded() -> None:
     again = view.points[known] / view.points[known, 2:] @ intrinsics.K.T
     np.testing.assert_allclose(again[:, :2], view.pixels[known], atol=1e-3)
     assert view.pixels[:, 0].std() > 0.15 * SIZE[0]
+    fixed = np.zeros((24, 78), bool)
+    fixed[:, 39:] = True
+    seen = extractor.view(Frame(3, 0.6, rendered.image, fixed), depth, height_m)
+    assert len(seen) > 100 and seen.pixels[:, 0].max() < SIZE[0] / 2
     blank = extractor.view(Frame(4, 0.4, np.full((SIZE[1], SIZE[0], 3), 90, np.uint8)), depth)
     assert len(blank) == 0
 

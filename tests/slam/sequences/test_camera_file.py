@@ -12,7 +12,7 @@ from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import CameraFile
 from slam.frames import Intrinsics
 from slam.runtime.errors import SequenceError
-from slam.sequences.camera_file import Undistortion, find_camera_file, read_explicit
+from slam.sequences.camera_file import Undistortion, find_camera_file, fixed_to, read_explicit
 
 IMAGES = Intrinsics(40, 24, 30, 30, 20, 12)
 WIDTH, HEIGHT = 320, 240
@@ -220,3 +220,28 @@ def test_folding_lens_is_refused_or_cropped() -> None:
     folded = lens("barrel").model_copy(update={"distortion": (-9.0, 3.0, 0.0, 0.0)})
     with pytest.raises(SequenceError, match=r"distortion \[-9.* folds the image"):
         Undistortion(folded)
+
+
+def test_black_of_a_mask_is_fixed_to_the_camera(tmp_path: Path) -> None:
+    """Found beside the file, bent with the images; another size or no file is one line."""
+    keys = {"width": 320, "height": 240, "fx": 200.0, "fy": 200.0, "cx": 160.0, "cy": 120.0}
+    text = "".join(f"{name}: {value}\n" for name, value in {**keys, "fps": 10}.items())
+    mask = np.full((240, 320), 255, np.uint8)
+    mask[180:] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    plain = read_explicit(written(tmp_path, f"{text}mask: mask.png\n"))
+    np.testing.assert_array_equal(fixed_to(plain, None), mask == 0)
+    bent = "mask: mask.png\nmodel: opencv\ndistortion: [-0.2, 0, 0, 0]\n"
+    barrel = read_explicit(written(tmp_path, text + bent))
+    undistortion = Undistortion(barrel)
+    fixed = fixed_to(barrel, undistortion)
+    image = undistortion.apply(np.repeat(mask[..., None], 3, axis=2))
+    assert fixed is not None and fixed.any() and not fixed[:170].any()
+    np.testing.assert_array_equal(fixed, image[..., 0] < 128)
+    assert fixed_to(read_explicit(written(tmp_path, text)), None) is None
+    cv2.imwrite(str(tmp_path / "mask.png"), mask[::2])
+    with pytest.raises(DataError, match="320x120, its camera 320x240"):
+        fixed_to(plain, None)
+    (tmp_path / "mask.png").unlink()
+    with pytest.raises(DataError, match=r"mask\.png"):
+        fixed_to(plain, None)

@@ -23,7 +23,13 @@ from slam.loops.verification import Loop
 from slam.mapping.depth import KeyframeDepth
 from slam.results.folder import RunFolder
 from slam.results.report.figures import MapView
-from slam.results.report.page import DepthPictures, Picture, loop_pictures, write_report
+from slam.results.report.page import (
+    DepthPictures,
+    Picture,
+    fixed_pictures,
+    loop_pictures,
+    write_report,
+)
 
 MakeRun = Callable[..., RunFolder]
 MakeMetrics = Callable[..., dict[str, Any]]
@@ -393,3 +399,13 @@ def test_a_request_of_the_page_would_be_refused_and_said(report: Path) -> None:
     picture = '<img alt="" src="http://127.0.0.1:9/picture.png">'
     _, console = browse(changed(report, "asking.html", picture), "--dump-dom")
     assert len(console) == 1 and "Content Security Policy" in console[0]
+
+
+def test_what_is_fixed_to_the_camera_is_red() -> None:
+    fixed = np.zeros((30, 40), bool)
+    assert not fixed_pictures(np.full((120, 160, 3), 90, np.uint8), fixed)
+    fixed[20:] = True
+    (picture,) = fixed_pictures(np.full((120, 160, 3), 90, np.uint8), fixed)
+    image = pixels(picture)[..., ::-1]
+    assert picture.title == "33 % of the image" and np.ptp(image[10].astype(int)) < 10
+    assert image[-10, :, 0].min() > image[-10, :, 1].max() + 50

@@ -34,7 +34,8 @@ _EDGE = 0.8  # least mean gradient at an edge, grey levels a pixel
 # the mean of the gradient over its mean length: at fixed edges, more where few images were seen
 _FIXED, _FIXED_OF_FEW = 0.55, 4.0
 _WORLD = 0.35  # and at most where the world passes
-# share of world below the edge of a bonnet, which reflects it; a reflection on the windscreen has more
+# share of world below the edge of a bonnet, which reflects it; below that of a reflection on the
+# windscreen there is more
 _PASSES = 0.6
 _SMOOTH = 0.04  # of the width, over which the outline of what is hidden is smoothed
 _TOWARDS_MIDDLE = 0.5  # cosine of the angle between a gradient and the direction to the middle
@@ -123,7 +124,9 @@ class FixedMask:
         for turns, least_width in enumerate(_BROAD):
             turned = np.rot90(joined, turns), np.rot90(world, turns)
             fixed |= np.rot90(_below_broad_edges(*turned, least_width), -turns)
-        return cv2.dilate(fixed.view(np.uint8), _MARGIN).astype(np.bool_) if fixed.any() else None
+        if not fixed.any():
+            return None
+        return np.asarray(cv2.dilate(fixed.view(np.uint8), _MARGIN), np.bool_)
 
 
 def _below_broad_edges(edges: NDArray[np.uint8], world: Mask, least_width: float) -> Mask:
@@ -141,14 +144,15 @@ def _below_broad_edges(edges: NDArray[np.uint8], world: Mask, least_width: float
     below &= passes < _PASSES
     columns = np.flatnonzero(below.any(axis=0))
     if len(columns):
-        # a bonnet reaches from side to side, also where its edge looks now darker, now brighter than the road
+        # a bonnet reaches from side to side, also where its edge is now darker, now brighter than
+        # the road
         span = np.arange(edges.shape[1])
         top = np.interp(span, columns, below.argmax(axis=0)[columns])
         top = running_median(top, 2 * round(_SMOOTH * edges.shape[1]) + 1)
         is_hidden = passes[top.astype(np.intp), span] < _PASSES
         is_hidden[columns[0] : columns[-1] + 1] = True
         below = is_hidden & (np.arange(len(edges))[:, None] >= top)
-    return below
+    return np.asarray(below)
 
 
 def _local(grey: Grey) -> _Layer:

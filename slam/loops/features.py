@@ -17,6 +17,7 @@ from slam.frames import (
     DepthMap,
     Descriptors,
     Frame,
+    Grey,
     Intrinsics,
     View,
     nearest_depth,

@@ -41,6 +41,14 @@ def with_caption(grey: Grey, k: int) -> Grey:
     return covered
 
 
+def with_mirror(grey: Grey, k: int) -> Grey:
+    """With a mirror, in which the way back is seen."""
+    covered = grey.copy()
+    covered[3:45, 385:508] = cv2.resize(street()[FRAMES - 1 - k][:, ::-1], (123, 42))
+    cv2.rectangle(covered, (385, 3), (508, 45), 10, 5)
+    return covered
+
+
 def found_in(images: list[Grey]) -> Mask:
     """The mask ``(H, W)`` after a drive."""
     fixed = FixedMask()
@@ -64,6 +72,13 @@ def test_a_caption_is_found_though_its_digits_change() -> None:
     found = found_in([with_caption(image, k) for k, image in enumerate(street())])
     assert found[6:18, 12:90].mean() > 0.6
     assert found[32:].mean() < 0.02
+
+
+def test_the_frame_of_a_mirror_is_found_and_the_world_around_it_stays() -> None:
+    found = found_in([with_mirror(image, k) for k, image in enumerate(street())])
+    assert found[44:47, 400:490].mean() > 0.6
+    found[:52, 378:516] = False
+    assert found.mean() < 0.02
 
 
 @pytest.mark.parametrize("passes", [False, True])

@@ -34,6 +34,7 @@ from slam.runtime.stopwatch import Stopwatch
 
 LEVELS = (50, 90, 95)  # per cent of the factors that the bounds of their stated noise hold
 _NO_TRUTH = Failed("the sequence has no true poses")
+_NO_HEIGHTS = Failed("the GPS track has no altitudes")
 _BY_MAPS = Failed("maps of keyframes give the poses, not steps from frame to frame")
 _NO_MAP_YET = Failed("the run ended before its map was whole")
 
@@ -265,8 +266,11 @@ def _gps(result: Estimate, in_graph: bool) -> records.GpsMetrics | Failed:
     return records.GpsMetrics.of(
         fixes=len(location.fixes.stamps),
         in_graph=in_graph,
-        origin=records.Origin(
-            latitude_deg=latitude, longitude_deg=longitude, altitude_m=height, heading_deg=heading
+        origin=records.Origin.of(
+            latitude_deg=latitude,
+            longitude_deg=longitude,
+            altitude_m=height if location.fixes.has_heights else _NO_HEIGHTS,
+            heading_deg=heading,
         ),
         odometry=aligned
         if isinstance(aligned, Failed)
@@ -280,8 +284,10 @@ def _distances(
 ) -> records.GpsErrors:
     apart = fixes.offsets(T_enu_world @ trajectory.T_world_camera)
     level = np.linalg.norm(apart[:, :2], axis=1)
-    return records.GpsErrors(
+    return records.GpsErrors.of(
         horizontal_rmse_m=float(np.sqrt((level**2).mean())),
         horizontal_median_m=float(np.median(level)),
-        vertical_rmse_m=float(np.sqrt((apart[:, 2] ** 2).mean())),
+        vertical_rmse_m=float(np.sqrt((apart[:, 2] ** 2).mean()))
+        if fixes.has_heights
+        else _NO_HEIGHTS,
     )

@@ -154,6 +154,16 @@ def test_a_table_of_times_cut_to_match_as_advised(tmp_path: Path, images, camera
     assert len(open_sequence(tmp_path)) == 2
 
 
+def test_times_beside_the_folder_of_images_that_is_named(
+    tmp_path: Path, images, camera_yaml: str
+) -> None:
+    (tmp_path / "images").mkdir()
+    images(tmp_path / "images", ["0.png", "1.png"])
+    (tmp_path / "camera.yaml").write_text(camera_yaml)
+    (tmp_path / "times.txt").write_text("5.0\n5.3\n")
+    assert open_sequence(tmp_path / "images").stamps.tolist() == [5.0, 5.3]
+
+
 def test_a_camera_of_another_size_scaled_as_advised(
     tmp_path: Path, images, camera_yaml: str
 ) -> None:

@@ -213,7 +213,7 @@ def read_opencv_yaml(path: Path) -> Any:
 def lens_model(
     name: str | None, distortion: Sequence[float]
 ) -> Literal["pinhole", "opencv", "fisheye"]:
-    """The model of ``camera.yaml`` of a lens as another program names it; without a name 4, 5 or 8 numbers are OpenCV's.
+    """The model of ``camera.yaml`` of a lens by another program; without a name 4, 5 or 8 numbers are OpenCV's.
 
     Raises:
         DataError: it is unknown, or is said to have no distortion, but has ``distortion``.

@@ -138,7 +138,7 @@ def _packet_times(path: Path) -> NDArray[np.float64] | None:
     except ImportError:
         return None
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(path.absolute())) as container:
             stream = container.streams.video[0]
             packets = (
                 packet for packet in container.demux(stream) if not packet.is_discard
@@ -176,7 +176,7 @@ def _capture(path: Path) -> cv2.VideoCapture:
     os.environ.setdefault(
         "OPENCV_FFMPEG_LOGLEVEL", _QUIET
     )  # errors are reported by DataError alone
-    capture = cv2.VideoCapture(str(path))
+    capture = cv2.VideoCapture(str(path.absolute()))
     if not capture.isOpened():
         raise DataError(
             f"video {path} cannot be opened: copy it again, or convert it to mp4 (H.264)"

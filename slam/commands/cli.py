@@ -202,6 +202,7 @@ def evaluate(
     from slam.commands import evaluation
 
     files, limits = [Path(path) for path in paths], fail_over or []
+    evaluation.require_metrics(limits)
     if reference is not None:
         evaluation.against_reference(paths, reference, frames, format, limits, as_json, csv)
     elif frames or csv:

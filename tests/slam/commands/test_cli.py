@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -239,7 +240,7 @@ def test_fail_over(call: Call, make_run: MakeRun) -> None:
     assert json.loads(out)["align"]
     for limit, words in (("beauty=1", "no metric 'beauty'"), ("ate_rmse_m=few", "METRIC=VALUE")):
         code, _, err = call("evaluate", *files, "--fail-over", limit)
-        assert code == 1 and words in err
+        assert code == 2 and words in " ".join(err.split())
 
 
 def test_evaluate_runs_side_by_side(call: Call, make_run: MakeRun) -> None:
@@ -292,6 +293,10 @@ def test_evaluate_systems_against_one_reference(call: Call, make_run: MakeRun) -
     ):
         code, _, err = call("evaluate", *words, "--reference", truth)
         assert code == 1 and err.count("\n") == 1 and wanted in err
+    shutil.copy("orb_0.txt", "orb [1].txt")
+    assert call("evaluate", "orb=orb [1].txt", "--reference", truth)[0] == 0
+    code, _, err = call("evaluate", "/dev/urandom", "--reference", truth)
+    assert code == 1 and "/dev/urandom: larger than" in err
     code, _, err = call("evaluate", run.path, "--reference", truth, "--csv", "orb_0.txt")
     assert code == 1 and "choose another" in err
 

@@ -22,7 +22,8 @@ from slam.frames import Sequence as FrameSequence
 from slam.frontend.drive import DOUBLED
 from slam.frontend.gps import GpsFixes, Location
 from slam.frontend.lidar_odometry import LidarPath
-from slam.geometry.se3 import FloatArray, umeyama
+from slam.frontend.visual.odometry import STILL_SOURCE
+from slam.geometry.se3 import FloatArray, path_distance, umeyama
 from slam.graph.pose_graph import whitened_squared
 from slam.loops.closure import MOST_REJECTED, LoopClosures
 from slam.pipeline.estimate import Estimate
@@ -34,6 +35,7 @@ from slam.runtime.stopwatch import Stopwatch
 
 LEVELS = (50, 90, 95)  # per cent of the factors that the bounds of their stated noise hold
 _NO_TRUTH = Failed("the sequence has no true poses")
+_TOP_SPEED_S = 1.0  # steps alone are noisy
 _NO_HEIGHTS = Failed("the GPS track has no altitudes")
 _BY_MAPS = Failed("maps of keyframes give the poses, not steps from frame to frame")
 _NO_MAP_YET = Failed("the run ended before its map was whole")
@@ -52,6 +54,7 @@ def estimate_metrics(
         reason="the run has not ended, or was killed while it made the map or the report",
         provenance=provenance,
         sequence=_sequence(result, sequence),
+        motion=_motion(result),
         timing=timing_of(result.stopwatch, len(sequence)),
         scale=_scale(result),
         agreement=[records.AgreementMetrics(**asdict(each)) for each in result.agreements],
@@ -109,6 +112,27 @@ def _sequence(result: Estimate, sequence: FrameSequence) -> records.SequenceMetr
         doubled=_stretches(dict.fromkeys(drive.doubled, DOUBLED)),
         unreadable_scans=_stretches(scans),
         segments=[records.Stretch(**asdict(segment)) for segment in drive.segments],
+    )
+
+
+def _motion(result: Estimate) -> records.MotionMetrics | Failed:
+    """How far and how fast the camera moved, and how often its steps were measured as standing."""
+    path, seconds = path_distance(result.optimised.T_world_camera), result.optimised.stamps
+    if len(path) < 2:
+        return Failed("a single frame does not move")
+    span = float(seconds[-1] - seconds[0])
+    window = min(_TOP_SPEED_S, span)
+    begins = seconds[seconds <= seconds[-1] - window]
+    ahead = np.interp(begins + window, seconds, path) - path[: len(begins)]
+    standing = [each for each in result.drive.motions if each.relative_pose.source == STILL_SOURCE]
+    steps = {each.ends for each in standing if each.ends[1] - each.ends[0] == 1}
+    return records.MotionMetrics.of(
+        path=float(path[-1]),
+        mean_speed=float(path[-1] / span),
+        top_speed=float(ahead.max() / window),
+        standing_share=len(steps) / (len(path) - 1)
+        if result.drive.support is not None
+        else _BY_MAPS,
     )
 
 

@@ -140,8 +140,15 @@ def test_run_prints_table_licence_and_place(
     assert "sim, scale none" in out and "networks' own unit" in out
     assert "none, untrained" in out and "LEAK" not in out
     assert "6 frames in" in out and "my run" in out and "report.html" not in out
-    metrics = RunFolder.open(Path("my run")).metrics().tree()
+    folder = RunFolder.open(Path("my run"))
+    metrics, path = folder.metrics().tree(), folder.trajectory("optimised")
     assert metrics["provenance"]["seed"] == 5
+    motion = metrics["motion"]
+    assert path is not None and motion["path"] == pytest.approx(path.length_m, rel=1e-4)
+    seconds = path.stamps[-1] - path.stamps[0]
+    assert motion["mean_speed"] == pytest.approx(path.length_m / seconds, rel=1e-4)
+    assert motion["standing_share"] == 0.0
+    assert re.search(r"^estimated path: \S+ the networks' own unit, ", out, re.MULTILINE)
     assert shlex.split(metrics["provenance"]["command"]) == [
         "erfsfm-slam",
         *map(str, arguments),

@@ -112,7 +112,8 @@ def find_camera_file(
 def explicit_camera(given: Path, images: Sized, fps: float | None = None) -> CameraFile:
     """The camera that the user named; arguments as in `find_camera_file`.
 
-    That of a field of view is a pinhole with square pixels and the principal point in the middle.
+    That of a field of view is a pinhole with its principal point in the middle; pixels are square unless a video
+    says otherwise.
 
     Raises:
         SequenceError: there is no such file, or the field of view is impossible.
@@ -134,10 +135,14 @@ def explicit_camera(given: Path, images: Sized, fps: float | None = None) -> Cam
         images.height,
         f"a horizontal field of view of {fov_deg:g} degrees",
     )
+    aspect = getattr(images, "pixel_aspect", 1.0)
+    if aspect != 1.0:
+        logger.warning("pixels are %.3g times as wide as high, as the video says", aspect)
     focal_px = width / 2 / math.tan(math.radians(fov_deg) / 2)
     centre = (width - 1) / 2, (height - 1) / 2
     return camera_of(
-        pinhole_keys(width, height, focal_px, focal_px, *centre, fps=fps, source=source), str(given)
+        pinhole_keys(width, height, focal_px, aspect * focal_px, *centre, fps=fps, source=source),
+        str(given),
     )
 
 
@@ -244,7 +249,7 @@ def _kalibr(camera: Keys) -> Keys:
         raise DataError(
             f"the camera_model {camera['camera_model']} is unknown: calibrate as pinhole"
         )
-    distortion = camera.get("distortion_coeffs", camera.get("distortion_coefficients", []))
+    distortion = camera.get("distortion_coeffs") or camera.get("distortion_coefficients") or []
     keys = pinhole_keys(*camera["resolution"], *camera["intrinsics"], distortion=distortion)
     rate = {"fps": camera["rate_hz"]} if "rate_hz" in camera else {}
     return {**keys, **rate, "model": lens_model(camera.get("distortion_model"), distortion)}

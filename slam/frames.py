@@ -294,13 +294,16 @@ class GpsTrack:
 
     Attributes:
         stamps: seconds ``(M,)``, increasing.
-        places: latitude and longitude in degrees, height over the ellipsoid or the sea in metres, ``(M, 3)``.
+        places: latitude and longitude in degrees, height over the ellipsoid or the sea in metres, ``(M, 3)``;
+            heights are NaN where the receiver gives none.
         dilution: of precision, factors on the usual sigmas of a fix ``(M,)``.
+        speeds: metres a second ``(M,)``, NaN where unknown.
     """
 
     stamps: FloatArray
     places: FloatArray
     dilution: FloatArray
+    speeds: FloatArray
 
 
 def runs(frames: Collection[int]) -> list[tuple[int, int]]:

@@ -8,6 +8,7 @@ import sys
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
+from io import TextIOWrapper
 from typing import TextIO
 
 import typer
@@ -74,6 +75,9 @@ def run(app: Callable[..., object], name: str, level: int) -> None:
         os.environ.setdefault(variable, value)
     if not shows_traceback() and not sys.warnoptions:
         warnings.simplefilter("ignore")
+    for stream in (sys.stdout, sys.stderr):  # a terminal in ASCII has no sign for every name
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")
     Terminal(level)
     try:
         app(args=sys.argv[1:], prog_name=name)

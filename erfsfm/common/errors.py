@@ -1,12 +1,16 @@
 """The errors a user can cause; the command line prints them as one line and exits with 1."""
 
 import os
+import re
 import traceback
 from pathlib import Path
 
 _LONGEST = 700
 _LAST = 200
 _OF_WORKER = "Original Traceback (most recent call last)"
+# the user and password of an address, and what its query calls a secret
+_USER = re.compile(r"(?<=://)[^\s/'\"]+@")
+_SECRET = re.compile(r"(?<=[?&])(pass\w*|pwd|token|key|auth|secret)=[^\s&'\"]+", re.IGNORECASE)
 SHOW_TRACEBACK = "ERFSFM_TRACEBACK"
 
 OUT_OF_MEMORY = (
@@ -22,14 +26,19 @@ _MEMORY = (
 )
 
 
+def without_secrets(text: str) -> str:
+    """A text that may name addresses of streams, without their users and passwords."""
+    return _SECRET.sub(r"\1=...", _USER.sub("...@", text))
+
+
 def one_line(text: str) -> str:
-    """A message without line breaks; the middle of a very long one is left out.
+    """A message without line breaks and secrets; the middle of a very long one is left out.
 
     Of an error of a data loader's process, to which PyTorch adds its traceback, only the message stays.
     """
     if _OF_WORKER in text:
         text = text.strip().splitlines()[-1].partition(": ")[2]
-    line = " ".join(text.splitlines())
+    line = without_secrets(" ".join(text.splitlines()))
     return line if len(line) <= _LONGEST else f"{line[: _LONGEST - _LAST]} ... {line[-_LAST:]}"
 
 

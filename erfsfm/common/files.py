@@ -86,8 +86,11 @@ def read_bytes(path: Path, most: int) -> bytes:
     Raises:
         OSError: it cannot be read, or is larger.
     """
-    if path.stat().st_size <= most and len(content := path.read_bytes()) <= most:
-        return content
+    if path.stat().st_size <= most:
+        with path.open("rb") as file:  # a device has no size, and no end
+            content = file.read(most + 1)
+        if len(content) <= most:
+            return content
     raise OSError(errno.EFBIG, f"larger than {most / 2**20:g} MiB", str(path))
 
 

@@ -202,6 +202,7 @@ def evaluate(
     from slam.commands import evaluation
 
     files, limits = [Path(path) for path in paths], fail_over or []
+    evaluation.require_metrics(limits)
     if reference is not None:
         evaluation.against_reference(paths, reference, frames, format, limits, as_json, csv)
     elif frames or csv:
@@ -481,7 +482,7 @@ def doctor(
 def _print_run(folder: RunFolder) -> None:
     """The errors of a run, what raises doubt, and where everything is."""
     from slam.results.report.tables import by_reason
-    from slam.results.tables import errors_table, written
+    from slam.results.tables import errors_table, motion_line, written
     from slam.results.verdict import verdict
     from slam.runtime.files import REPORT
 
@@ -492,6 +493,8 @@ def _print_run(folder: RunFolder) -> None:
         typer.echo(f"{title}: no errors, for {sequence.why('length_m')}")
     else:
         errors_table(metrics.evaluated_errors(), title).print()
+    if line := motion_line(metrics):
+        typer.echo(f"estimated path: {line}")
     if (sure := metrics.confidence.run) is not None:
         typer.echo(
             f"confidence {written(sure, 2)}: this share of drives like it err by at most 1 % of their path"

@@ -19,11 +19,19 @@ from slam.evaluation.trajectory import TrajectoryMetrics, evo_commands, exceeded
 from slam.formats.trajectory import Trajectory, associate, read_trajectory
 from slam.results import tables
 from slam.results.folder import RunFolder, check_replaced
-from slam.runtime.errors import RunError, SlamError, TrajectoryError
+from slam.runtime.errors import ConfigError, RunError, SlamError, TrajectoryError
 from slam.runtime.files import REFERENCE, trajectory_file, write_atomically
 from slam.sequences.recording import frame_range
 
 logger = logging.getLogger(__name__)
+
+
+def require_metrics(limits: Sequence[str]) -> None:
+    """Refuse limits of metrics that there are not; ``typer.BadParameter``."""
+    try:
+        exceeded(TrajectoryMetrics.unknown(""), limits)
+    except ConfigError as error:
+        raise typer.BadParameter(str(error), param_hint="--fail-over") from error
 
 
 def against_reference(
@@ -120,7 +128,8 @@ def named_paths(words: Sequence[str]) -> list[tuple[str, Path]]:
             path = Path(word)
             found.append((path.resolve().name if path.is_dir() else path.stem, path))
             continue
-        paths = sorted(glob(pattern))  # noqa: PTH207 - Path.glob takes no whole path
+        # brackets may be those of a name; Path.glob takes no whole path
+        paths = [pattern] if Path(pattern).exists() else sorted(glob(pattern))  # noqa: PTH207
         if not paths:
             raise RunError(f"{word}: no file or folder is named {pattern}")
         found += [(name, Path(path)) for path in paths]

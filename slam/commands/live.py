@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from erfsfm.common.errors import without_secrets
 from erfsfm.common.files import FolderLock
 from erfsfm.common.signals import raising_on_termination
 from slam.commands.run import FolderRecorder, Request, provenance_of, record
@@ -64,7 +65,7 @@ def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
         camera = find_camera_file(
             request.camera, *folders, wanted_by=request.dataset, images=source, fps=source.fps
         )
-        source.fps, name = camera.fps, Path(request.dataset).stem or "live"
+        source.fps, name = camera.fps, Path(without_secrets(request.dataset)).stem or "live"
         sequence = StreamedSequence(name, source, camera, request.wait, request.every_frame)
         sequence.intrinsics = as_known(sequence.intrinsics, request.camera)
         prediction = open_prediction(

@@ -14,7 +14,7 @@ from pydantic import BeforeValidator, Field, ValidationError
 
 from erfsfm import __version__
 from erfsfm.common.config_tree import Section, first_problem
-from erfsfm.common.errors import explained
+from erfsfm.common.errors import explained, without_secrets
 from erfsfm.common.files import FolderLock
 from erfsfm.common.processes import limit_library_threads
 from erfsfm.common.progress import Progress, progress_bar, progress_lines, silent
@@ -107,7 +107,9 @@ class Request(Section):
         given = {name: getattr(self, name, None) for name in _RECORDING}
         named = {name: value for name, value in given.items() if value is not None}
         return {
-            name: from_anywhere(v) if name == "dataset" or isinstance(v, Path) else v
+            name: without_secrets(
+                from_anywhere(v) if name == "dataset" or isinstance(v, Path) else v
+            )
             for name, v in named.items()
         }
 
@@ -366,7 +368,7 @@ def provenance_of(request: Request, prediction: Prediction, recording: FrameSequ
     return Provenance(
         version=__version__,
         commit=commit(),
-        command=request.command,
+        command=without_secrets(request.command),
         seed=request.seed,
         device=str(networks.device),
         weights=from_anywhere(request.weights) if is_folder else request.weights,

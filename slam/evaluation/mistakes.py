@@ -17,6 +17,7 @@ from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 
 _BETTER = 3.0  # times; what fits by chance is nearer
+_MOST_GAIN = 1000.0  # times; what is beyond is rounding
 _EXACT = 1e-6  # of the extent of the path: an error that has no cause but rounding
 _UNITS = {1000.0: "millimetres", 100.0: "centimetres", 0.001: "kilometres"}
 _UNIT_TOLERANCE = 0.03
@@ -108,7 +109,8 @@ def likely_mistakes(
 
 
 def _said(words: str, before: float, after: float, unit: str = "m") -> str:
-    return f"{words} fits {before / max(after, 1e-12):.0f} times better ({after:.3g} {unit}, {before:.3g} as given)"
+    gain = before / max(after, before / _MOST_GAIN)
+    return f"{words} fits {gain:.0f} times better ({after:.3g} {unit}, {before:.3g} as given)"
 
 
 def _ate(estimate: FloatArray, reference: FloatArray) -> float:

@@ -37,6 +37,8 @@ SNIPPET_LENGTH = 5
 _SAME_ROTATION = 1e-9  # of the entries of a matrix
 # With fewer frames an alignment fits exactly, and its zero error is meaningless.
 _FEWEST_FRAMES: dict[Alignment, int] = {"none": 2, "first": 2, "scale": 3, "6dof": 3, "7dof": 3}
+_TURNED_DEG = 20.0  # by one of two trajectories, where the other has the same rotation in every row
+_STRAIGHT = 0.02  # of the length of a path, across it
 _NO_REFERENCE = "there is no reference trajectory"
 _NOTHING_MOVES = "neither the estimate nor the reference moves, so there is no error to measure"
 _BACKWARDS = Failed("the best scale is negative: the estimate goes the other way")
@@ -253,9 +255,17 @@ def trajectory_metrics(
         aligned = Alignments.of(**dict.fromkeys(ALIGNMENTS, AlignedMetrics.unknown(reason)))
         return TrajectoryMetrics(snippet5=snippets, align=aligned, evo=EvoMetrics.unknown(reason))
     T_world_estimate, T_world_reference = estimate.T_world_camera, reference.T_world_camera
+    unturned = _without_rotations(T_world_estimate, T_world_reference)
     ours = {
-        name: _alignment_metrics(T_world_estimate, T_world_reference, name) for name in ALIGNMENTS
+        name: _alignment_metrics(T_world_estimate, T_world_reference, name, unturned)
+        for name in ALIGNMENTS
     }
+    if unturned:
+        return TrajectoryMetrics(
+            snippet5=SnippetMetrics.unknown(unturned),
+            align=Alignments.of(**ours),
+            evo=EvoMetrics.unknown(unturned),
+        )
     predicted = snippets_from_trajectory(T_world_estimate, SNIPPET_LENGTH)
     true = snippets_from_trajectory(T_world_reference, SNIPPET_LENGTH)
     without_ate = None
@@ -394,9 +404,14 @@ def _why_not(estimate: Trajectory, reference: Trajectory | None) -> str:
 
 
 def _alignment_metrics(
-    T_world_estimate: FloatArray, T_world_reference: FloatArray, alignment: Alignment
+    T_world_estimate: FloatArray,
+    T_world_reference: FloatArray,
+    alignment: Alignment,
+    unturned: str = "",
 ) -> AlignedMetrics:
-    """The object A: errors of all rows after one alignment."""
+    """The object A: errors of all rows after one alignment; of positions alone where there are no rotations."""
+    if unturned and alignment in ("first", "scale"):
+        return AlignedMetrics.unknown(unturned)
     frames, fewest = len(T_world_estimate), _FEWEST_FRAMES[alignment]
     if frames < fewest:
         return AlignedMetrics.unknown(f"this alignment needs {fewest} frames; there are {frames}")
@@ -405,9 +420,10 @@ def _alignment_metrics(
     aligned = align(T_world_estimate, T_world_reference, alignment)
     if not isinstance(aligned.scale, Failed) and aligned.scale <= 0:
         return AlignedMetrics.unknown(_BACKWARDS.reason)
-    return AlignedMetrics.of(
-        **{name: each.formula(aligned) for name, each in AlignedMetrics.statistics().items()}
-    )
+    values = {name: each.formula(aligned) for name, each in AlignedMetrics.statistics().items()}
+    if unturned:
+        values |= dict.fromkeys(values.keys() - {"ate_rmse_m", "scale"}, Failed(unturned))
+    return AlignedMetrics.of(**values)
 
 
 def _snippet_metrics(
@@ -457,6 +473,23 @@ def _evo_metrics(
     pairs = zip(values.values(), (ours.ate_rmse_m, ours.rpe_trans_m, ours.rpe_rot_deg))
     differences = [abs(theirs - mine) for theirs, mine in pairs if mine is not None]
     return EvoMetrics.of(**values, difference=max(differences))
+
+
+def _without_rotations(T_world_estimate: FloatArray, T_world_reference: FloatArray) -> str:
+    """Which trajectory has one rotation in every row of a path that turns, while the other turns; else empty."""
+    both = {"reference": T_world_reference, "estimate": T_world_estimate}
+    for name, other in (("reference", "estimate"), ("estimate", "reference")):
+        R, R_other = both[name][:, :3, :3], both[other][:, :3, :3]
+        if np.ptp(R, axis=0).max() > _SAME_ROTATION:
+            continue
+        positions = both[name][:, :3, 3]
+        extents = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
+        turned = se3.rotation_angle(R_other[0].T @ R_other).max() > np.deg2rad(_TURNED_DEG)
+        if turned and extents[1] > _STRAIGHT * extents[0]:
+            return (
+                f"the {name} has no rotations: they are the same in every row of a path that turns"
+            )
+    return ""
 
 
 def _stands_still(T_world_camera: FloatArray) -> bool:

@@ -133,7 +133,9 @@ def _points(
             tracks.setdefault(point, []).append((frame + 1, corner))
     count = len(points_world)
     total = np.bincount(sightings.point, sightings.errors_px, count)
-    errors = total / np.maximum(np.bincount(sightings.point, minlength=count), 1)
+    sightings_of = np.bincount(sightings.point, minlength=count)
+    # a point without a track has COLMAP's -1
+    errors = np.where(sightings_of > 0, total / np.maximum(sightings_of, 1), -1.0)
     lines, parts = [], []
     for k, (place, colour, error) in enumerate(
         zip(points_world.tolist(), colours.tolist(), errors.tolist()), start=1

@@ -161,7 +161,7 @@ def _local(grey: Grey) -> _Layer:
     height, width = (max(side // ratio, 1) for side in grey.shape)
     whole = grey[: ratio * height, : ratio * width]
     small = np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
-    return small - np.asarray(cv2.GaussianBlur(small, (0, 0), _LOCAL_PX))
+    return np.asarray(small - cv2.GaussianBlur(small, (0, 0), _LOCAL_PX), np.float32)
 
 
 def _towards_middle(shape: tuple[int, ...]) -> tuple[_Layer, _Layer]:

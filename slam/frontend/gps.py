@@ -29,6 +29,8 @@ _LEAST_FIXES = 3
 _CHORDS = 10  # the path is divided into about so many chords to compare lengths
 _LEAST_MOTION_SIGMAS = 5.0
 _GOOD_CHORD_SIGMAS = 20.0  # fixes with sigmas of 2.5 and 5 m lengthen such a chord by 1 %
+_UNKNOWN_HEIGHT_SIGMA_M = 100.0  # of fixes without a height, which are laid on a level
+_LEAST_SPEED_M_S = 2.0  # receivers state speeds to some tenths
 _UP_SIGMA = 0.2  # radians between the camera's own up and that of the earth
 _ROUNDS = 30
 _HUBER_K = 1.345
@@ -48,6 +50,7 @@ class GpsFixes:
         sigmas: of single fixes ``(M, 3)``, metres.
         widening: factor on the sigmas for a graph, which takes errors as independent.
         frame: where east, north, up begin.
+        has_heights: whether the receiver gives them; else all fixes lie at height 0.
         agreement: of the fixes with the last path that was located by them.
     """
 
@@ -72,9 +75,15 @@ class GpsFixes:
                 f"{shifted[0]:.1f} to {shifted[-1]:.1f} s, the frames from {frame_stamps[0]:.1f} to "
                 f"{frame_stamps[-1]:.1f} s: set gps.offset_s, or give the track of this drive"
             )
-        self.stamps, self.frame = shifted[inside], LocalFrame(track.places[inside][0])
-        self.points = self.frame.points(track.places[inside])
-        own = np.array([config.sigma_m, config.sigma_m, config.vertical_sigma_m])
+        places = track.places[inside]
+        self.has_heights = bool(np.isfinite(places).all())
+        if not self.has_heights:
+            places = np.nan_to_num(places)
+        self.stamps, self.frame = shifted[inside], LocalFrame(places[0])
+        self.points = self.frame.points(places)
+        self._speeds = track.speeds[inside]
+        up = config.vertical_sigma_m if self.has_heights else _UNKNOWN_HEIGHT_SIGMA_M
+        own = np.array([config.sigma_m, config.sigma_m, up])
         self.sigmas: FloatArray = own * track.dilution[inside][:, None]
         self.widening = float(
             np.sqrt(max(config.correlation_s / float(np.median(np.diff(self.stamps))), 1.0))
@@ -87,8 +96,11 @@ class GpsFixes:
 
         Errors of fixes lengthen a chord by about their variance over its length. So chords are a
         tenth of the fixes, or several of them where these span less than 20 sigmas, and are chosen
-        by the camera's lengths: choosing by GPS would prefer chords that errors lengthen.
+        by the camera's lengths: choosing by GPS would prefer chords that errors lengthen. Speeds of the receiver, which
+        do not share the errors of its places, give the lengths where it states them.
         """
+        if (found := self._by_speeds(T_world_camera_unscaled)) is not None:
+            return found
         estimated = self._camera(T_world_camera_unscaled)
         sigma = float(np.median(self.sigmas[:, 0]))
         least = _LEAST_MOTION_SIGMAS * sigma
@@ -117,6 +129,23 @@ class GpsFixes:
             next((s for s in spans if metres * np.median(chords(s)[1]) >= good), longest)
         )
         usable = metres * by_camera > least
+        ratios = by_gps[usable] / by_camera[usable]
+        value = float(np.median(ratios))
+        return ScaleEstimate(value, mad_sigma(np.log(ratios / value)), int(usable.sum()))
+
+    def _by_speeds(self, T_world_camera: FloatArray) -> ScaleEstimate | None:
+        """The scale by what was driven at the stated speeds; None without any, or where too few tenths move."""
+        known = np.isfinite(self._speeds)
+        if not known.any():
+            return None
+        speeds = np.interp(self.stamps, self.stamps[known], self._speeds[known])
+        driven = np.r_[0.0, np.cumsum(np.diff(self.stamps) * (speeds[1:] + speeds[:-1]) / 2)]
+        path = np.interp(self.stamps, self._frame_stamps, se3.path_distance(T_world_camera))
+        edges = np.arange(0, len(path), max(len(path) // _CHORDS, 1))
+        by_gps, by_camera = np.diff(driven[edges]), np.diff(path[edges])
+        usable = (by_gps > _LEAST_SPEED_M_S * np.diff(self.stamps[edges])) & (by_camera > 0)
+        if usable.sum() < MIN_FRAMES:
+            return None
         ratios = by_gps[usable] / by_camera[usable]
         value = float(np.median(ratios))
         return ScaleEstimate(value, mad_sigma(np.log(ratios / value)), int(usable.sum()))

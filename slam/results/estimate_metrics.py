@@ -22,7 +22,8 @@ from slam.frames import Sequence as FrameSequence
 from slam.frontend.drive import DOUBLED
 from slam.frontend.gps import GpsFixes, Location
 from slam.frontend.lidar_odometry import LidarPath
-from slam.geometry.se3 import FloatArray, umeyama
+from slam.frontend.visual.odometry import STILL_SOURCE
+from slam.geometry.se3 import FloatArray, path_distance, umeyama
 from slam.graph.pose_graph import whitened_squared
 from slam.loops.closure import MOST_REJECTED, LoopClosures
 from slam.pipeline.estimate import Estimate
@@ -34,6 +35,8 @@ from slam.runtime.stopwatch import Stopwatch
 
 LEVELS = (50, 90, 95)  # per cent of the factors that the bounds of their stated noise hold
 _NO_TRUTH = Failed("the sequence has no true poses")
+_TOP_SPEED_S = 1.0  # steps alone are noisy
+_NO_HEIGHTS = Failed("the GPS track has no altitudes")
 _BY_MAPS = Failed("maps of keyframes give the poses, not steps from frame to frame")
 _NOTHING_FIXED = Failed(
     "nothing was found that is fixed to the camera, or too few images moved to find it"
@@ -54,6 +57,7 @@ def estimate_metrics(
         reason="the run has not ended, or was killed while it made the map or the report",
         provenance=provenance,
         sequence=_sequence(result, sequence),
+        motion=_motion(result),
         timing=timing_of(result.stopwatch, len(sequence)),
         scale=_scale(result),
         agreement=[records.AgreementMetrics(**asdict(each)) for each in result.agreements],
@@ -112,6 +116,27 @@ def _sequence(result: Estimate, sequence: FrameSequence) -> records.SequenceMetr
         unreadable_scans=_stretches(scans),
         segments=[records.Stretch(**asdict(segment)) for segment in drive.segments],
         fixed_share=_NOTHING_FIXED if drive.fixed is None else float(drive.fixed.mean()),
+    )
+
+
+def _motion(result: Estimate) -> records.MotionMetrics | Failed:
+    """How far and how fast the camera moved, and how often its steps were measured as standing."""
+    path, seconds = path_distance(result.optimised.T_world_camera), result.optimised.stamps
+    if len(path) < 2:
+        return Failed("a single frame does not move")
+    span = float(seconds[-1] - seconds[0])
+    window = min(_TOP_SPEED_S, span)
+    begins = seconds[seconds <= seconds[-1] - window]
+    ahead = np.interp(begins + window, seconds, path) - path[: len(begins)]
+    standing = [each for each in result.drive.motions if each.relative_pose.source == STILL_SOURCE]
+    steps = {each.ends for each in standing if each.ends[1] - each.ends[0] == 1}
+    return records.MotionMetrics.of(
+        path=float(path[-1]),
+        mean_speed=float(path[-1] / span),
+        top_speed=float(ahead.max() / window),
+        standing_share=len(steps) / (len(path) - 1)
+        if result.drive.support is not None
+        else _BY_MAPS,
     )
 
 
@@ -269,8 +294,11 @@ def _gps(result: Estimate, in_graph: bool) -> records.GpsMetrics | Failed:
     return records.GpsMetrics.of(
         fixes=len(location.fixes.stamps),
         in_graph=in_graph,
-        origin=records.Origin(
-            latitude_deg=latitude, longitude_deg=longitude, altitude_m=height, heading_deg=heading
+        origin=records.Origin.of(
+            latitude_deg=latitude,
+            longitude_deg=longitude,
+            altitude_m=height if location.fixes.has_heights else _NO_HEIGHTS,
+            heading_deg=heading,
         ),
         odometry=aligned
         if isinstance(aligned, Failed)
@@ -284,8 +312,10 @@ def _distances(
 ) -> records.GpsErrors:
     apart = fixes.offsets(T_enu_world @ trajectory.T_world_camera)
     level = np.linalg.norm(apart[:, :2], axis=1)
-    return records.GpsErrors(
+    return records.GpsErrors.of(
         horizontal_rmse_m=float(np.sqrt((level**2).mean())),
         horizontal_median_m=float(np.median(level)),
-        vertical_rmse_m=float(np.sqrt((apart[:, 2] ** 2).mean())),
+        vertical_rmse_m=float(np.sqrt((apart[:, 2] ** 2).mean()))
+        if fixes.has_heights
+        else _NO_HEIGHTS,
     )

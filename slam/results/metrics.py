@@ -61,6 +61,18 @@ class SequenceMetrics(Record):
     fixed_share: float | None = None
 
 
+class MotionMetrics(Record):
+    """Length of the optimised path, speed on average and at most over a second, share of the steps said to stand.
+
+    In the unit of lengths, and in that a second.
+    """
+
+    path: float | None = None
+    mean_speed: float | None = None
+    top_speed: float | None = None
+    standing_share: float | None = None
+
+
 class Timing(Record):
     """Seconds, frames a second over the whole run, processor seconds, peak memory, seconds by stage."""
 
@@ -232,6 +244,7 @@ class Metrics(Record):
     reason: str | None = None
     provenance: Provenance = part(Provenance)
     sequence: SequenceMetrics = part(SequenceMetrics)
+    motion: MotionMetrics = part(MotionMetrics)
     timing: Timing = part(Timing)
     scale: ScaleMetrics = part(ScaleMetrics)
     agreement: list[AgreementMetrics] | None = None

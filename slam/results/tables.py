@@ -11,6 +11,7 @@ from slam.evaluation.trajectory import ALIGNMENTS, AlignedMetrics, TrajectoryMet
 from slam.results.metrics import Metrics
 
 UNITS = "ATE: RMSE, m; of snippets of five frames, each with its own scale, norm / 5. RE: rad. t_rel, r_rel: 7 dof."
+_KMH = 3.6  # of a metre a second
 _LEAK = "LEAK: the weights were trained on the sequence; the numbers are no test."
 
 
@@ -45,6 +46,19 @@ def written(value: Any, decimals: int) -> str:
         return str(value)
     tiny = value != 0 and abs(value) < 0.5 * 10.0**-decimals
     return f"{value:.1e}" if tiny else f"{value:.{decimals}f}"
+
+
+def motion_line(metrics: Metrics) -> str:
+    """How far and how fast a run says that the camera moved; empty where it does not say."""
+    motion, unit = metrics.motion, metrics.unit
+    if motion.path is None:
+        return ""
+    factor, speed_unit = (_KMH, "km/h") if metrics.is_metric else (1.0, f"{unit} a second")
+    mean, top = (factor * (each or 0.0) for each in (motion.mean_speed, motion.top_speed))
+    length = f"{written(motion.path, 1)} {'m' if metrics.is_metric else unit}"
+    line = f"{length}, {written(mean, 1)} {speed_unit} on average, {written(top, 1)} at most"
+    share = motion.standing_share
+    return line if share is None else f"{line}, standing in {100 * share:.0f} % of the steps"
 
 
 def errors_table(trajectories: Mapping[str, TrajectoryMetrics], title: str = "") -> Table:

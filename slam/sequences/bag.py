@@ -279,7 +279,8 @@ def camera_file_of(
         getattr(info, key.upper() if hasattr(info, key.upper()) else key) for key in "kpd"
     )
     try:
-        model = lens_model(None if rectified or not np.any(distortion) else info.distortion_model)
+        used = [] if rectified else [float(value) for value in distortion]
+        model = lens_model(info.distortion_model if any(used) else None, used)
     except DataError as error:
         raise SequenceError(f"{where}: {error}") from error
     fx, _, cx, *_ = P if rectified else K
@@ -299,7 +300,7 @@ def camera_file_of(
         fx, fy = fx / binning_x, fy / binning_y
         cx = (cx - roi.x_offset + 0.5) / binning_x - 0.5
         cy = (cy - roi.y_offset + 0.5) / binning_y - 0.5
-    coefficients = [] if model == "pinhole" else [float(value) for value in distortion]
+    coefficients = [] if model == "pinhole" else used
     keys = pinhole_keys(
         width, height, fx, fy, cx, cy, fps=fps, model=model, distortion=coefficients
     )

@@ -1,7 +1,8 @@
 """Which camera a sequence has: a calibration or a field of view given by the user, or the recording's own.
 
 The keys of ``camera.yaml`` are described in `erfsfm.common.readers.camera_file`. Calibrations of other programs are
-read as well: Kalibr, EuRoC, ROS's camera_info YAML, ORB-SLAM's settings, COLMAP's cameras.txt. Images of a distorted
+read as well: Kalibr, EuRoC, ROS's camera_info YAML, settings of ORB-SLAM and
+VINS, COLMAP's cameras.txt. Images of a distorted
 lens are undistorted to a pinhole camera, as they are read.
 """
 
@@ -10,7 +11,7 @@ from __future__ import annotations
 import logging
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -32,6 +33,7 @@ logger = logging.getLogger(__name__)
 
 DEFAULT_FPS = 10.0
 _FOV = re.compile(r"fov=(?P<fov>\d+\.?\d*)(?:,fps=(?P<fps>\d+\.?\d*))?")
+_ORB_COEFFICIENT = re.compile(r"Camera1?\.[kp]\d")
 _FOV_LIMITS_DEG = (3.0, 150.0)
 
 _OF_THE_MOUNTING = ("camera_height_m", "readout_ms", "mask")  # which no calibration knows
@@ -47,6 +49,11 @@ LENSES: dict[str | None, Literal["pinhole", "opencv", "fisheye"]] = {
     **dict.fromkeys(("equidistant", "fisheye", "KannalaBrandt8"), "fisheye"),
     **dict.fromkeys(("none", "None", "", None, "Rectified"), "pinhole"),
 }
+_ORB_COEFFICIENTS = {
+    "pinhole": (),  # of images that are rectified
+    "opencv": ("k1", "k2", "p1", "p2", "k3"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}
 # COLMAP: places of fx, fy, cx, cy among the parameters, those of k1 k2 p1 p2 k3 ... (-1: zero), and the model
 _COLMAP: dict[str, tuple[tuple[int, ...], tuple[int, ...], str]] = {
     "SIMPLE_PINHOLE": ((0, 0, 1, 2), (), "pinhole"),
@@ -57,6 +64,7 @@ _COLMAP: dict[str, tuple[tuple[int, ...], tuple[int, ...], str]] = {
     "OPENCV_FISHEYE": ((0, 1, 2, 3), (4, 5, 6, 7), "fisheye"),
     "FULL_OPENCV": ((0, 1, 2, 3), (4, 5, 6, 7, 8, 9, 10, 11), "opencv"),
 }
+_NAMELESS = (4, 5, 8)  # coefficients of OpenCV, which files without a name of the lens mean
 _ZOOM_STEP = 1.02
 _ZOOM_LIMITS = (0.2, 8.0)
 _UNLIKELY_ZOOM, _FOLDED_ZOOM = 1.5, 3.0
@@ -106,7 +114,8 @@ def find_camera_file(
 def explicit_camera(given: Path, images: Sized, fps: float | None = None) -> CameraFile:
     """The camera that the user named; arguments as in `find_camera_file`.
 
-    That of a field of view is a pinhole with square pixels and the principal point in the middle.
+    That of a field of view is a pinhole with its principal point in the middle; pixels are square unless a video
+    says otherwise.
 
     Raises:
         SequenceError: there is no such file, or the field of view is impossible.
@@ -128,10 +137,14 @@ def explicit_camera(given: Path, images: Sized, fps: float | None = None) -> Cam
         images.height,
         f"a horizontal field of view of {fov_deg:g} degrees",
     )
+    aspect = getattr(images, "pixel_aspect", 1.0)
+    if aspect != 1.0:
+        logger.warning("pixels are %.3g times as wide as high, as the video says", aspect)
     focal_px = width / 2 / math.tan(math.radians(fov_deg) / 2)
     centre = (width - 1) / 2, (height - 1) / 2
     return camera_of(
-        pinhole_keys(width, height, focal_px, focal_px, *centre, fps=fps, source=source), str(given)
+        pinhole_keys(width, height, focal_px, aspect * focal_px, *centre, fps=fps, source=source),
+        str(given),
     )
 
 
@@ -204,17 +217,27 @@ def read_opencv_yaml(path: Path) -> Any:
     )
 
 
-def lens_model(name: str | None) -> Literal["pinhole", "opencv", "fisheye"]:
-    """The model of ``camera.yaml`` of a lens as another program names it.
+def lens_model(
+    name: str | None, distortion: Sequence[float]
+) -> Literal["pinhole", "opencv", "fisheye"]:
+    """The model of ``camera.yaml`` of a lens by another program; without a name 4, 5 or 8 numbers are OpenCV's.
 
     Raises:
-        DataError: it is unknown.
+        DataError: it is unknown, or is said to have no distortion, but has ``distortion``.
     """
     if name not in LENSES:
         raise DataError(
             f"the lens model {name} is unknown: known are {', '.join(filter(None, LENSES))}; give --camera"
         )
-    return LENSES[name]
+    model = LENSES[name]
+    if model != "pinhole" or not any(distortion):
+        return model
+    if not name and len(distortion) in _NAMELESS:
+        return "opencv"
+    raise DataError(
+        f"the lens model {name!r} has no distortion, but {len(distortion)} coefficients are there: name their model, "
+        "or leave them out"
+    )
 
 
 def pinhole_keys(width: Any, height: Any, fx: Any, fy: Any, cx: Any, cy: Any, **more: Any) -> Keys:
@@ -228,31 +251,47 @@ def _kalibr(camera: Keys) -> Keys:
         raise DataError(
             f"the camera_model {camera['camera_model']} is unknown: calibrate as pinhole"
         )
-    distortion = camera.get("distortion_coeffs", camera.get("distortion_coefficients", []))
+    distortion = camera.get("distortion_coeffs") or camera.get("distortion_coefficients") or []
     keys = pinhole_keys(*camera["resolution"], *camera["intrinsics"], distortion=distortion)
     rate = {"fps": camera["rate_hz"]} if "rate_hz" in camera else {}
-    return {**keys, **rate, "model": lens_model(camera.get("distortion_model"))}
+    return {**keys, **rate, "model": lens_model(camera.get("distortion_model"), distortion)}
 
 
 def _camera_info(content: Keys) -> Keys:
     fx, _, cx, _, fy, cy, *_ = content["camera_matrix"]["data"]
     keys = pinhole_keys(content["image_width"], content["image_height"], fx, fy, cx, cy)
     distortion = content.get("distortion_coefficients", {}).get("data", [])
-    return {**keys, "model": lens_model(content.get("distortion_model")), "distortion": distortion}
+    model = lens_model(content.get("distortion_model"), distortion)
+    return {**keys, "model": model, "distortion": distortion}
 
 
 def _orb_slam(content: Keys) -> Keys:
     prefix = "Camera1" if "Camera1.fx" in content else "Camera"
     focal = (content[f"{prefix}.{name}"] for name in ("fx", "fy", "cx", "cy"))
-    model = lens_model(content.get("Camera.type", "PinHole"))
-    names = ("k1", "k2", "k3", "k4") if model == "fisheye" else ("k1", "k2", "p1", "p2", "k3")
+    model = lens_model(content.get("Camera.type", "PinHole"), ())
+    names = _ORB_COEFFICIENTS[model]
     keys = pinhole_keys(content["Camera.width"], content["Camera.height"], *focal)
     keys |= {"fps": content["Camera.fps"]} if "Camera.fps" in content else {}
-    return {
-        **keys,
-        "model": model,
-        "distortion": [content.get(f"{prefix}.{name}", 0.0) for name in names],
-    }
+    known = [f"{prefix}.{name}" for name in names]
+    unused = [
+        key
+        for key in content
+        if _ORB_COEFFICIENT.fullmatch(key) and content[key] and key not in known
+    ]
+    if unused:
+        raise DataError(f"{', '.join(unused)} of a {model} lens cannot be used: give a camera.yaml")
+    return {**keys, "model": model, "distortion": [content.get(name, 0.0) for name in known]}
+
+
+def _vins(content: Keys) -> Keys:
+    if content.get("model_type") != "PINHOLE":
+        raise DataError(
+            f"the model_type {content.get('model_type')} is unknown: calibrate as PINHOLE"
+        )
+    pinhole, lens = content["projection_parameters"], content["distortion_parameters"]
+    focal = (pinhole[name] for name in ("fx", "fy", "cx", "cy"))
+    keys = pinhole_keys(content["image_width"], content["image_height"], *focal)
+    return {**keys, "model": "opencv", "distortion": [lens[n] for n in ("k1", "k2", "p1", "p2")]}
 
 
 def _colmap(text: str) -> Keys:
@@ -265,6 +304,8 @@ def _colmap(text: str) -> Keys:
                 f"COLMAP's camera model {name} is unknown: known are {', '.join(_COLMAP)}"
             )
         places, coefficients, model = _COLMAP[name]
+        if len(words) != 1 + max(places + coefficients):
+            raise ValueError(f"{name} has other parameters")
         values = [*map(float, words), 0.0]
         fx, fy, cx, cy = (values[place] for place in places)
         distortion = [values[place] for place in coefficients]
@@ -279,6 +320,7 @@ _PROGRAMS: dict[str, tuple[str, Callable[[Keys], Keys]]] = {
     "cam0": ("Kalibr", lambda content: _kalibr(content["cam0"])),
     "T_BS": ("EuRoC", _kalibr),
     "camera_matrix": ("ROS", _camera_info),
+    "projection_parameters": ("VINS", _vins),
     "Camera.fx": ("ORB-SLAM", _orb_slam),
     "Camera1.fx": ("ORB-SLAM", _orb_slam),
 }

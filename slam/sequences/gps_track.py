@@ -4,38 +4,62 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from collections.abc import Iterable
+from datetime import UTC, datetime
 from functools import reduce
 from operator import xor
 from pathlib import Path
 
 import numpy as np
 
-from slam.formats.rows import BadRows, in_seconds, text_of
+from slam.formats.rows import BadRows, in_seconds, number_or_nan, text_of
 from slam.frames import GpsTrack
 from slam.runtime.errors import SequenceError
 
-_COLUMNS = ("stamp", "latitude", "longitude", "altitude")
+# usual spellings of the columns; the first three are needed
+_COLUMNS = {
+    "stamp": ("stamp", "time", "timestamp", "t", "seconds"),
+    "latitude": ("latitude", "lat"),
+    "longitude": ("longitude", "lon", "lng", "long"),
+    "altitude": ("altitude", "alt", "ele", "elevation", "height"),
+    "hdop": ("hdop",),
+}
+_NEEDED = ("stamp", "latitude", "longitude")
+# metres a second in the unit of a column of speeds, by the letters of its name
+_SPEED_UNITS = {
+    **dict.fromkeys(("speed", "speedms", "speedmps"), 1.0),
+    **dict.fromkeys(("speedkmh", "speedkph"), 1 / 3.6),
+    "speedmph": 0.44704,
+    **dict.fromkeys(("speedkn", "speedknots"), 0.514444),
+}
+_MOST_SPEED_RATIO = 1.5  # of stated speeds and those of the fixes; units differ by more
+_LEAST_SPEED_M_S = 5.0  # at which fixes a second apart tell a unit
 _DAY_S = 86400.0
 _EARTH_RADIUS_M = 6.371e6
 FASTEST_M_S = 300.0
 _LEAST_FIXES = 3  # one step may be an error of one fix
 _MOST = np.array([90.0, 180.0, 1e5])
-_NO_FIX = [math.nan] * 5
+_NO_FIX = [math.nan] * 6
 
 
 def read_gps(path: Path) -> GpsTrack:
     """Read a GPS track.
 
-    CSV has a header with ``stamp`` in seconds on the clock of the images, ``latitude`` and ``longitude`` in degrees,
-    ``altitude`` in metres and, optionally, ``hdop``. Of NMEA, GGA sentences are read; their stamps are seconds of the
-    first day.
+    CSV has a header with ``stamp`` in seconds on the clock of the images (times as in ISO 8601 become seconds since
+    1970), ``latitude`` and ``longitude`` in degrees and, optionally, ``altitude`` in metres, ``hdop`` and a speed whose
+    name says its unit (``speed_kmh``; metres a second without one). Of NMEA, GGA sentences with an altitude are read;
+    their stamps are seconds of the first day.
 
     Raises:
-        SequenceError: the file cannot be read, holds no fix with an altitude, or moves at an
-            impossible speed.
+        SequenceError: the file cannot be read, holds no fix, moves at an impossible speed, or states
+            speeds that are not those of its fixes.
     """
     text = text_of(path, SequenceError, "a GPS track")
+    if text.lstrip().startswith("<"):
+        raise SequenceError(
+            f"{path} is XML, such as GPX, which is not read: convert it to CSV ({','.join(_NEEDED)}) or to NMEA"
+        )
     lines = text.splitlines()
     try:
         found = _nmea_rows(lines) if text.lstrip().startswith("$") else _csv_rows(lines, path)
@@ -44,14 +68,15 @@ def read_gps(path: Path) -> GpsTrack:
     if not found:
         wrong = sum("*" in line and _sentence(line) == [""] for line in lines)
         raise SequenceError(
-            f"{path} holds no GPS fix with an altitude: CSV with a header {','.join(_COLUMNS)}, or NMEA is read"
+            f"{path} holds no GPS fix: CSV with a header {','.join(_NEEDED)}, or NMEA with altitudes is read"
             + (f"; {wrong} sentences have a wrong checksum" if wrong else "")
         )
     bad, rows = BadRows(path, SequenceError), np.array([row for row, _ in found], np.intp)
     table = np.array([fix for _, fix in found], dtype=np.float64)
+    known = table[:, [0, 1, 2, 4] if np.isnan(table[:, 3]).all() else range(5)]
     is_fix = (
-        np.isfinite(table).all(axis=1)
-        & (abs(table[:, 1:4]) <= _MOST).all(axis=1)
+        np.isfinite(known).all(axis=1)
+        & ~(abs(table[:, 1:4]) > _MOST).any(axis=1)
         & (table[:, 4] > 0)
     )
     needed = "no GPS fix: a stamp, degrees, metres and a dilution above 0 are needed"
@@ -67,27 +92,62 @@ def read_gps(path: Path) -> GpsTrack:
         raise SequenceError(
             f"{path}: its fixes move at {speed}: check its columns, and that stamps are seconds"
         )
-    return GpsTrack(table[:, 0], table[:, 1:4], table[:, 4])
+    own = table[np.isfinite(table[:, 5]), 5]
+    ratio = np.median(own) / np.median(speeds) if len(own) and len(speeds) else 1.0
+    is_fast = len(speeds) > 0 and np.median(speeds) > _LEAST_SPEED_M_S
+    if is_fast and not 1 / _MOST_SPEED_RATIO < ratio < _MOST_SPEED_RATIO:
+        raise SequenceError(
+            f"{path}: its speeds are {ratio:.2f} times those of its fixes: let the column's name say the unit, such "
+            "as speed_kmh or speed_mph, or leave it out"
+        )
+    return GpsTrack(table[:, 0], table[:, 1:4], table[:, 4], table[:, 5])
 
 
 def _csv_rows(lines: list[str], path: Path) -> list[tuple[int, list[float]]]:
-    """Lines with stamp, latitude, longitude, altitude, dilution; NaN where a row is none."""
+    """Lines with stamp, latitude, longitude, altitude, dilution, speed in m/s.
+
+    NaN where a row is no fix, and where a track has no altitude or no speed.
+    """
     delimiter = max(",;\t", key=lines[0].count) if lines else ","
     reader = csv.DictReader(lines, skipinitialspace=True, delimiter=delimiter)
-    missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
+    places = {}
+    for column, spellings in _COLUMNS.items():
+        named = [name for name in reader.fieldnames or () if name.strip().lower() in spellings]
+        places[column] = next(iter(named), "")
+    missing = [name for name in _NEEDED if not places[name]]
     if missing:
         raise SequenceError(
-            f"{path} lacks {', '.join(missing)}: its first row must name {', '.join(_COLUMNS)}"
+            f"{path} lacks {', '.join(missing)}: its first row must name {', '.join(_NEEDED)}"
         )
+    units = {
+        name: _SPEED_UNITS.get(re.sub("[^a-z]", "", name.lower()))
+        for name in reader.fieldnames or ()
+    }
+    speed, unit = next(((name, unit) for name, unit in units.items() if unit), ("", math.nan))
     rows = []
     for row in reader:
         try:
-            stamp, *place = (row[name] for name in _COLUMNS)
-            numbers = [float(word) for word in (in_seconds(stamp), *place, row.get("hdop") or 1.0)]
+            numbers = [
+                _seconds(row[places["stamp"]]),
+                float(row[places["latitude"]]),
+                float(row[places["longitude"]]),
+                float(row[places["altitude"]]) if places["altitude"] else math.nan,
+                float(row.get(places["hdop"]) or 1.0),
+                unit * number_or_nan(row.get(speed) or ""),
+            ]
         except (TypeError, ValueError):
             numbers = _NO_FIX
         rows.append((reader.line_num, numbers))
     return rows
+
+
+def _seconds(word: str) -> float:
+    """A stamp as seconds; those of a date in UTC since 1970; ``ValueError`` where it is neither."""
+    seconds = number_or_nan(in_seconds(word))
+    if not math.isnan(seconds):
+        return seconds
+    moment = datetime.fromisoformat(word.strip())
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
 def _nmea_rows(lines: Iterable[str]) -> list[tuple[int, list[float]]]:
@@ -104,7 +164,7 @@ def _nmea_rows(lines: Iterable[str]) -> list[tuple[int, list[float]]]:
             if stamp < before - _DAY_S / 2:
                 stamp += _DAY_S
             place = _degrees(words[2], words[3]), _degrees(words[4], words[5]), float(words[9])
-            fix = [stamp, *place, float(words[8] or 1.0)]
+            fix = [stamp, *place, float(words[8] or 1.0), math.nan]
         except ValueError:
             fix = _NO_FIX
         if fix[0] != before:

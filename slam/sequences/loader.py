@@ -69,7 +69,7 @@ class Loader:
 
 
 def open_folder(folder: Path, asked: Path | None) -> RecordedSequence:
-    """Open a folder of images in natural order, at the stamps of its ``times.txt`` or the camera's frame rate.
+    """Open a folder of images in natural order, at the stamps of a ``times.txt`` or the camera's frame rate.
 
     Raises:
         SequenceError: there are no images or no camera, or their stamps do not match.
@@ -84,10 +84,11 @@ def open_folder(folder: Path, asked: Path | None) -> RecordedSequence:
     stored = ImageFiles(files)
     places = (where, folder, folder.absolute().parent)
     camera = find_camera_file(asked, *places, wanted_by=f"images in {where}", images=stored)
+    home = recording_folder(folder)
     stamps = _times_of_images(
-        [place / name for place in (where, folder) for name in TIMES], files, camera.fps
+        [place / name for place in (where, folder, home) for name in TIMES], files, camera.fps
     )
-    name = recording_folder(folder).name
+    name = home.name
     return RecordedSequence(name, stored, camera, stamps, (Source(f"folder/{name}"),))
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from erfsfm.common.errors import DataError
+from erfsfm.common.errors import DataError, without_secrets
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.images import (
     IMAGE_SUFFIXES,
@@ -260,7 +260,7 @@ class VideoSource:
         Raises:
             SequenceError: it is a pipe, or no image comes.
         """
-        self._name, self._wait_s = name, wait_s
+        self._address, self._name, self._wait_s = name, without_secrets(name), wait_s
         self.is_stored = (
             Path(name).is_file() and Path(name).suffix.lower() not in _DESCRIBED_STREAMS
         )
@@ -299,14 +299,13 @@ class VideoSource:
 
     def _opened(self, stopped: Event) -> Image | None:
         """The first image; None where none comes in time."""
+        name = self._address
         is_patient = not self.is_stored and (
-            self._name.isdecimal() or "://" in self._name or Path(self._name).exists()
+            name.isdecimal() or "://" in name or Path(name).exists()
         )
         deadline = time.monotonic() + (self._wait_s if is_patient else 0.0)
         while True:
-            self._capture: Any = cv2.VideoCapture(
-                int(self._name) if self._name.isdecimal() else self._name
-            )
+            self._capture: Any = cv2.VideoCapture(int(name) if name.isdecimal() else name)
             image = self._next()
             if image is not None or time.monotonic() > deadline or stopped.wait(_RETRY_S):
                 return image

@@ -31,7 +31,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from tf2_ros import Buffer, TransformBroadcaster, TransformException, TransformListener
 
-from erfsfm.common.errors import ErfsfmError
+from erfsfm.common.errors import ErfsfmError, OneLineError
 from slam import Slam
 from slam.config.sections import load_config
 from slam.formats.trajectory import write_tum
@@ -105,8 +105,12 @@ class SlamNode(Node):  # type: ignore[misc,unused-ignore]
         """Take the calibration; of ``image_rect...`` that of the rectified camera."""
         if self._slam is None:
             rectified = is_rectified(self.resolve_topic_name("image"))
-            camera = camera_file_of(info, rectified, DEFAULT_FPS, "camera_info")
-            intrinsics, self._undistortion = undistorted(camera)
+            try:
+                camera = camera_file_of(info, rectified, DEFAULT_FPS, "camera_info")
+                intrinsics, self._undistortion = undistorted(camera)
+            except OneLineError as error:  # another message may be calibrated
+                self.get_logger().error(str(error), once=True)
+                return
             config = load_config(None, self._of["settings"].split())
             height_m = self._of["camera_height_m"] or None
             self._slam = Slam.from_weights(

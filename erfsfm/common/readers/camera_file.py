@@ -17,7 +17,7 @@ from erfsfm.common.errors import DataError, ErfsfmError
 CAMERA_FILE = "camera.yaml"
 logger = logging.getLogger(__name__)
 
-HIGHEST_M = 1000.0
+HIGHEST_M = 100.0  # a camera that sees a road; heights in centimetres are beyond
 _USUAL_HEIGHTS_M = (0.1, 10.0)
 _COEFFICIENTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,), "fov": (1,)}
 
@@ -70,7 +70,8 @@ class CameraFile(BaseModel):
         height_m = self.camera_height_m
         if not isinstance(height_m, str | None) and not 0 < height_m <= HIGHEST_M:
             raise ValueError(
-                f"camera_height_m: must be greater than 0, to {HIGHEST_M:g}, or 'unknown', is {height_m}"
+                f"camera_height_m: must be metres above the road, greater than 0, to {HIGHEST_M:g}, or 'unknown', is "
+                f"{height_m}"
             )
         if self.readout_ms > 1e3 / self.fps:
             raise ValueError(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
+import struct
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,6 +19,7 @@ from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError, OneLineError
 from erfsfm.common.files import MAX_IMAGE_BYTES, read_bytes
+from erfsfm.common.readers.camera_file import MOST_PIXELS
 
 logger = logging.getLogger(__name__)
 
@@ -38,6 +41,7 @@ _JPEG_SEGMENT = re.compile(
     rb"\xff[^\x00\x01\xd0-\xd8\xff]", re.DOTALL
 )  # begins one with a length, or is the end
 _PNG_START, _PNG_END, _PNG_BIT_DEPTH = b"\x89PNG", b"IEND", 24
+_PNG_SIZE = struct.Struct(">II")  # width and height
 _ENDS_PERCENT = (0.1, 99.9)  # of the values: what is beyond is black or white
 _WIDE = 32768  # range of values from which on the upper eight bits show enough
 _STRETCHED_BY = 16  # images of a recording
@@ -189,13 +193,15 @@ def decode_values(data: bytes, where: str, flags: int = cv2.IMREAD_UNCHANGED) ->
         raise DataError(f"{where} is empty: copy it again")
     if not _is_complete(data):
         raise DataError(f"{where} is truncated at {len(data)} bytes: copy it again")
+    too_many = DataError(f"{where} has more pixels than any camera: resize it, or leave it out")
+    # the header of a PNG is asked, for few kilobytes may unpack to gigabytes
+    if data.startswith(_PNG_START) and math.prod(_PNG_SIZE.unpack_from(data, 16)) > MOST_PIXELS:
+        raise too_many
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
         if "MAX_IMAGE_PIXELS" in str(error):
-            raise DataError(
-                f"{where} has more pixels than any camera: resize it, or leave it out"
-            ) from error
+            raise too_many from error
         raise DataError(f"{where} cannot be decoded: {error.err or error}") from error
     if image is None:
         raise DataError(f"{where} cannot be decoded: it is damaged or not an image; copy it again")

@@ -36,6 +36,7 @@ class VideoFrames:
 
     Attributes:
         fps: frames a second by their times, else as announced; None where the file does not say.
+        pixel_aspect: width of a pixel over its height.
     """
 
     def __init__(self, path: Path, counted_frames: int = _COUNTED_FRAMES) -> None:
@@ -73,6 +74,13 @@ class VideoFrames:
             self.fps = (self._frames - 1) / float(self._shown_s[-1] - self._shown_s[0])
         self._cached = functools.lru_cache(maxsize=_CACHED_FRAMES)(self._decode)
         self.height, self.width = self._cached(0).shape[:2]
+        wide = self._capture.get(cv2.CAP_PROP_SAR_NUM)
+        high = self._capture.get(cv2.CAP_PROP_SAR_DEN)
+        self.pixel_aspect = wide / high if wide > 0 and high > 0 else 1.0
+        if (
+            self._capture.get(cv2.CAP_PROP_ORIENTATION_META) % 180
+        ):  # the frames are turned, it is not
+            self.pixel_aspect = 1.0 / self.pixel_aspect
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -138,7 +146,7 @@ def _packet_times(path: Path) -> NDArray[np.float64] | None:
     except ImportError:
         return None
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(path.absolute())) as container:
             stream = container.streams.video[0]
             packets = (
                 packet for packet in container.demux(stream) if not packet.is_discard
@@ -176,7 +184,7 @@ def _capture(path: Path) -> cv2.VideoCapture:
     os.environ.setdefault(
         "OPENCV_FFMPEG_LOGLEVEL", _QUIET
     )  # errors are reported by DataError alone
-    capture = cv2.VideoCapture(str(path))
+    capture = cv2.VideoCapture(str(path.absolute()))
     if not capture.isOpened():
         raise DataError(
             f"video {path} cannot be opened: copy it again, or convert it to mp4 (H.264)"

@@ -12,7 +12,7 @@ from markupsafe import Markup
 from erfsfm.common.table import Table
 from slam.evaluation.map import SurfaceMetrics
 from slam.results.metrics import CAMERA_HEIGHTS, METRES, Metrics, Stretch
-from slam.results.tables import written
+from slam.results.tables import motion_line, written
 from slam.runtime.files import MEANINGS, REPORT
 
 _MOST = 12  # of one kind
@@ -46,7 +46,7 @@ def key_numbers(metrics: Metrics, has_map: bool) -> list[tuple[str, str, str]]:
         ("Drift, t_rel", best.dof7.t_rel_percent, 2, "%"),
         ("Path", metrics.sequence.length_m, 0, "m"),
         ("Frames", metrics.sequence.frames, 0, ""),
-        ("Speed", metrics.timing.frames_per_second, 1, "frames/s"),
+        ("Processing", metrics.timing.frames_per_second, 1, "frames/s"),
         ("Loops accepted", metrics.loops.accepted, 0, ""),
         ("Map triangles", metrics.map.triangles if has_map else None, 0, ""),
     ]
@@ -65,6 +65,7 @@ def what_ran(metrics: Metrics) -> Table:
     shas = [sha and f"sha256 {sha[:16]}" for sha in (ran.weights_sha256, ran.depth_sha256)]
     rows = [
         ("Sequence", _joined(sequence.name, frames, rate)),
+        ("Estimated path", motion_line(metrics)),
         ("Interpolated frames", "; ".join(by_reason(sequence.bridged or ()))),
         ("Doubled frames", "; ".join(by_reason(sequence.doubled or ()))),
         ("LiDAR scans left out", "; ".join(by_reason(sequence.unreadable_scans or ()))),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -38,6 +39,18 @@ def test_a_warning_that_repeats_is_said_once() -> None:
         [sys.executable, "-c", program], capture_output=True, text=True, check=False
     ).stderr
     assert said.splitlines() == ["WARNING images: image 0", "program: the error"]
+
+
+def test_a_terminal_in_ascii_shows_what_it_can() -> None:
+    program = (
+        "from erfsfm.common.command_line import run\n"
+        "run(lambda args, prog_name: print('drive \u2014 m\u00fcde'), 'program', 30)"
+    )
+    ascii_only = {**os.environ, "PYTHONIOENCODING": "ascii:strict"}
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=ascii_only, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "drive ? m?de\n"
 
 
 def raising(error: Exception) -> Callable[[object], object]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -139,8 +140,15 @@ def test_run_prints_table_licence_and_place(
     assert "sim, scale none" in out and "networks' own unit" in out
     assert "none, untrained" in out and "LEAK" not in out
     assert "6 frames in" in out and "my run" in out and "report.html" not in out
-    metrics = RunFolder.open(Path("my run")).metrics().tree()
+    folder = RunFolder.open(Path("my run"))
+    metrics, path = folder.metrics().tree(), folder.trajectory("optimised")
     assert metrics["provenance"]["seed"] == 5
+    motion = metrics["motion"]
+    assert path is not None and motion["path"] == pytest.approx(path.length_m, rel=1e-4)
+    seconds = path.stamps[-1] - path.stamps[0]
+    assert motion["mean_speed"] == pytest.approx(path.length_m / seconds, rel=1e-4)
+    assert motion["standing_share"] == 0.0
+    assert re.search(r"^estimated path: \S+ the networks' own unit, ", out, re.MULTILINE)
     assert shlex.split(metrics["provenance"]["command"]) == [
         "erfsfm-slam",
         *map(str, arguments),
@@ -239,7 +247,7 @@ def test_fail_over(call: Call, make_run: MakeRun) -> None:
     assert json.loads(out)["align"]
     for limit, words in (("beauty=1", "no metric 'beauty'"), ("ate_rmse_m=few", "METRIC=VALUE")):
         code, _, err = call("evaluate", *files, "--fail-over", limit)
-        assert code == 1 and words in err
+        assert code == 2 and words in " ".join(err.split())
 
 
 def test_evaluate_runs_side_by_side(call: Call, make_run: MakeRun) -> None:
@@ -292,6 +300,10 @@ def test_evaluate_systems_against_one_reference(call: Call, make_run: MakeRun) -
     ):
         code, _, err = call("evaluate", *words, "--reference", truth)
         assert code == 1 and err.count("\n") == 1 and wanted in err
+    shutil.copy("orb_0.txt", "orb [1].txt")
+    assert call("evaluate", "orb=orb [1].txt", "--reference", truth)[0] == 0
+    code, _, err = call("evaluate", "/dev/urandom", "--reference", truth)
+    assert code == 1 and "/dev/urandom: larger than" in err
     code, _, err = call("evaluate", run.path, "--reference", truth, "--csv", "orb_0.txt")
     assert code == 1 and "choose another" in err
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from threading import Thread
@@ -210,6 +211,38 @@ def test_what_the_settings_need_is_asked_before_the_first_frame(
     with pytest.raises(SlamError, match=words):
         run_live(request, messages.append)
     assert messages == [] and not (tmp_path / "live").exists()
+
+
+def test_the_password_of_an_address_is_written_nowhere(
+    street: Path, tiny_weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    address = "rtsp://me:hush@camera/drive?pwd=quiet&x=1"
+    images, opened, capture = str(street / "images" / "%06d.png"), [], cv2.VideoCapture
+
+    def open_street(name: str) -> cv2.VideoCapture:
+        opened.append(name)
+        return capture(images)
+
+    monkeypatch.setattr(cv2, "VideoCapture", open_street)
+    settings, command = [*SETTINGS, f"output.root={tmp_path}"], f"erfsfm-slam live {address}"
+    request = LiveRequest(
+        dataset=address,
+        weights=str(tiny_weights),
+        overrides=settings,
+        camera=street / "camera.yaml",
+        wait=0.5,
+        command=command,
+    )
+    with suppress(SlamError):  # where too few images come before the last
+        run_live(request, lambda message: None)
+    assert set(opened) == {address}
+    metrics = next(tmp_path.glob("*/metrics.json"))  # also by the link to the latest run
+    assert "rtsp://...@camera/drive?pwd=...&x=1" in metrics.read_text()
+    for path in tmp_path.rglob("*"):
+        text = path.read_text(errors="replace") if path.is_file() else ""
+        assert not re.search("hush|quiet", f"{path.name} {text}"), path
+    with pytest.raises(SlamError, match=r"rtsp://\.\.\.@camera"):
+        raise SlamError(f"no image comes from {address}")
 
 
 @pytest.mark.parametrize("frames", [2, 9])

@@ -111,3 +111,9 @@ def test_a_sparse_reference_is_compared_at_its_own_times() -> None:
     assert len(ours) == len(theirs) == 29
     np.testing.assert_allclose(ours.positions, theirs.positions, atol=0.15)
     assert said(estimate, truth) == []
+
+
+def test_the_gain_of_an_exact_fit_is_bounded() -> None:
+    truth = drive()
+    (line,) = said(changed(truth, truth.T_world_camera[::-1]), truth)
+    assert "fits 1000 times better" in line

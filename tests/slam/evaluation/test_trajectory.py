@@ -229,6 +229,20 @@ def test_a_camera_that_turns_on_the_spot_has_errors_of_rotation() -> None:
     assert metrics["align"]["first"]["rpe_rot_deg"] == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("unturned", ["reference", "estimate"])
+def test_without_rotations_only_positions_are_compared(unturned: str) -> None:
+    pair = {"reference": drive(), "estimate": drive()}
+    pair[unturned][:, :3, :3] = np.eye(3)
+    metrics = metrics_of(trajectory(pair["estimate"]), trajectory(pair["reference"]))
+    check_shape(metrics)
+    whole = metrics["align"]["6dof"]
+    assert whole["ate_rmse_m"] == pytest.approx(0.0, abs=1e-6)
+    for key in ("t_rel_percent", "r_rel_deg_per_100m", "rpe_trans_m", "rpe_rot_deg"):
+        assert whole[key] is None and f"the {unturned} has no rotations" in whole[f"{key}_reason"]
+    assert metrics["align"]["first"]["ate_rmse_m"] is None
+    assert metrics["snippet5"]["re_mean"] is None
+
+
 def test_a_straight_line_is_measured_though_evo_fails() -> None:
     metrics = metrics_of(trajectory(line(120, 0.5)), trajectory(line(120)))
     check_shape(metrics)

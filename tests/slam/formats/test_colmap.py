@@ -78,7 +78,7 @@ def test_a_model_reads_back(tmp_path: Path) -> None:
     assert (camera_id, model, width, height) == ("1", "PINHOLE", "416", "128")
     fx, fy, cx, cy = map(float, pinhole)
     lines = rows(folder / "points3D.txt")
-    assert [line[7:] for line in lines] == [["1", "4", "1"], ["0.5", "1", "0", "4", "0"], ["0"]]
+    assert [line[7:] for line in lines] == [["1", "4", "1"], ["0.5", "1", "0", "4", "0"], ["-1"]]
     points = np.array([line[:7] for line in lines], dtype=float)
     np.testing.assert_array_equal(points[:, 0], [1, 2, 3])
     np.testing.assert_allclose(points[:, 1:4], POINTS, rtol=1e-5)

@@ -38,6 +38,7 @@ def scale(positions: FloatArray, seed: int) -> ScaleEstimate | Failed:
         seconds,
         LocalFrame(np.array([48.0, 11.0, 500.0])).places(enu + errors),
         np.ones(len(seconds)),
+        np.full(len(seconds), np.nan),
     )
     T_world_camera = np.tile(np.eye(4), (len(positions), 1, 1))
     T_world_camera[:, :3, 3] = positions
@@ -91,3 +92,20 @@ def test_a_minute_of_arc_has_its_length() -> None:
     assert np.hypot(north[0], north[1]) == pytest.approx(
         6378137.0**2 / 6356752.314245179 * minute, abs=1e-2
     )
+
+
+def test_speeds_give_the_lengths_of_a_walk_too_short_for_fixes_without_heights() -> None:
+    positions = 0.5 * straight(100.0)
+    stamps = np.arange(len(positions)) / HZ
+    seconds = np.arange(0.0, stamps[-1])
+    places = np.column_stack(
+        [np.full((len(seconds), 2), [48.0, 11.0]), np.full(len(seconds), np.nan)]
+    )
+    speeds = np.where(np.arange(len(seconds)) % 7 == 3, np.nan, 2 * SPEED)
+    track = GpsTrack(seconds, places, np.ones(len(seconds)), speeds)
+    T_world_camera = np.tile(np.eye(4), (len(positions), 1, 1))
+    T_world_camera[:, :3, 3] = positions
+    fixes = GpsFixes(track, stamps, CONFIG, "gps")
+    found = fixes.scale(T_world_camera)
+    assert isinstance(found, ScaleEstimate) and found.value == pytest.approx(4.0, rel=0.01)
+    assert not fixes.has_heights and (fixes.sigmas[:, 2] > 10 * fixes.sigmas[:, 0]).all()

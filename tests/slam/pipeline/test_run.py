@@ -462,7 +462,9 @@ def track(rng: np.random.Generator, sigma_m: float, outliers: int = 0) -> GpsTra
     )
     points += rng.normal(scale=sigma_m, size=points.shape)
     points[rng.choice(len(points), outliers, replace=False)] += [60.0, 40.0, 0.0]
-    return GpsTrack(stamps, LocalFrame(PLACE).places(points), np.ones(len(stamps)))
+    return GpsTrack(
+        stamps, LocalFrame(PLACE).places(points), np.ones(len(stamps)), np.full(len(stamps), np.nan)
+    )
 
 
 def located(gps: GpsTrack | None, *overrides: str, noise: OracleNoise | None = None) -> Estimate:
@@ -529,7 +531,7 @@ def test_fixes_of_another_drive_are_left_out_or_refused(
 ) -> None:
     gps = track(np.random.default_rng(0), 0.0)
     places = gps.places[::-1] if change == "backwards" else np.roll(gps.places, 30, axis=0)
-    other = GpsTrack(gps.stamps, places, gps.dilution)
+    other = GpsTrack(gps.stamps, places, gps.dilution, gps.speeds)
     settings = ("gps.sigma_m=0.2", "gps.vertical_sigma_m=0.2")
     result = located(other, *settings, "scale.mode=reference")
     found = next(each for each in result.agreements if each.source == "GPS")
@@ -541,7 +543,9 @@ def test_fixes_of_another_drive_are_left_out_or_refused(
 
 def test_a_camera_that_stands_is_not_located() -> None:
     gps = track(np.random.default_rng(0), 0.0)
-    result = located(GpsTrack(gps.stamps, np.tile(PLACE, (len(gps.stamps), 1)), gps.dilution))
+    result = located(
+        GpsTrack(gps.stamps, np.tile(PLACE, (len(gps.stamps), 1)), gps.dilution, gps.speeds)
+    )
     assert isinstance(result.location, Failed) and "moves too little" in result.location.reason
     assert isinstance(result.scale.estimate, Failed)
 

@@ -12,7 +12,8 @@ from erfsfm.common.table import Table
 from slam.evaluation.trajectory import TrajectoryMetrics, trajectory_metrics
 from slam.formats.trajectory import Trajectory
 from slam.results.folder import RunFolder
-from slam.results.tables import alignments_table, errors_table, runs_table
+from slam.results.metrics import Metrics
+from slam.results.tables import alignments_table, errors_table, motion_line, runs_table
 
 MakeRun = Callable[..., RunFolder]
 MakeMetrics = Callable[..., dict[str, Any]]
@@ -98,6 +99,16 @@ def test_the_errors_of_a_run_fit_a_terminal(printed: Callable[[Table], str]) -> 
         f"{align['7dof']['t_rel_percent']:.2f}",
     ]
     assert float(row.split()[1]) == pytest.approx(snippets["ate_mean"], abs=1e-4)
+
+
+def test_speeds_are_in_km_h_where_lengths_are_metres() -> None:
+    motion = {"path": 500.0, "mean_speed": 10.0, "top_speed": 15.0, "standing_share": 0.25}
+    assert motion_line(Metrics.of(motion=motion)) == (
+        "500.0 m, 36.0 km/h on average, 54.0 at most, standing in 25 % of the steps"
+    )
+    in_heights = Metrics.of(motion=motion, scale={"unit": "camera heights"})
+    assert "10.0 camera heights a second on average" in motion_line(in_heights)
+    assert motion_line(Metrics()) == ""
 
 
 def test_two_files_are_compared_under_every_alignment(printed: Callable[[Table], str]) -> None:

@@ -30,6 +30,14 @@ def written(folder: Path, text: str) -> Path:
     return folder / "camera.yaml"
 
 
+NAMELESS = """image_width: 40
+image_height: 24
+distortion_model: '{}'
+camera_matrix: {{data: [30, 0, 20, 0, 30, 12, 0, 0, 1]}}
+distortion_coefficients: {{data: {}}}
+"""
+
+
 def test_search_order(tmp_path: Path, camera_yaml: str) -> None:
     inner = tmp_path / "inner"
     inner.mkdir()
@@ -149,6 +157,15 @@ def test_lenses(tmp_path: Path) -> None:
         ),
         ("cameras.txt", "1 THIN_PRISM 40 24 1 2 3\n", "THIN_PRISM"),
         ("cameras.txt", "nothing\n", "CAMERA_ID"),
+        ("cameras.txt", "1 PINHOLE 40 24 30 30 20 12 -0.1 0.02\n", "COLMAP"),
+        ("ros.yaml", NAMELESS.format("none", [-0.1, 0, 0, 0]), "coefficients are there"),
+        ("ros.yaml", NAMELESS.format("", [-0.1, 0, 0]), "coefficients are there"),
+        (
+            "orb.yaml",
+            "Camera.fx: 30\nCamera.fy: 30\nCamera.cx: 20\nCamera.cy: 12\nCamera.width: 40\n"
+            "Camera.height: 24\nCamera.k4: 0.1\n",
+            "Camera.k4",
+        ),
     ],
 )
 def test_what_is_wrong_is_one_line(tmp_path: Path, name: str, text: str, words: str) -> None:
@@ -179,6 +196,29 @@ def seen_by_lens(points_camera: np.ndarray, camera: CameraFile) -> np.ndarray:
     points = points_camera[:, None] if camera.model == "fisheye" else points_camera
     pixels, _ = project(points, zero, zero, K, D)
     return pixels.reshape(-1, 2)
+
+
+@pytest.mark.parametrize("count", [4, 5, 8])
+def test_coefficients_without_a_name_are_those_of_opencv(tmp_path: Path, count: int) -> None:
+    distortion = [-0.1, 0.02, *[0.0] * (count - 2)]
+    (tmp_path / "ros.yaml").write_text(NAMELESS.format("", distortion))
+    camera = read_explicit(tmp_path / "ros.yaml")
+    assert (camera.model, list(camera.distortion)) == ("opencv", distortion)
+
+
+VINS = """%YAML:1.0
+model_type: PINHOLE
+image_width: 40
+image_height: 24
+distortion_parameters: {k1: -0.1, k2: 0.02, p1: 0.0, p2: 0.0}
+projection_parameters: {fx: 30, fy: 31, cx: 20, cy: 12}
+"""
+
+
+def test_settings_of_vins(tmp_path: Path) -> None:
+    (tmp_path / "vins.yaml").write_text(VINS)
+    camera = read_explicit(tmp_path / "vins.yaml")
+    assert (camera.model, camera.fy, camera.distortion) == ("opencv", 31, (-0.1, 0.02, 0.0, 0.0))
 
 
 @pytest.mark.parametrize("name", LENSES)

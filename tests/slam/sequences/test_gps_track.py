@@ -48,7 +48,9 @@ def test_nmea_around_midnight_and_without_an_altitude(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("time,lat\n1,2\n", "lacks stamp, latitude, longitude, altitude"),
+        ("time,lat\n1,2\n", "lacks longitude: its first row"),
+        ("<?xml version='1.0'?><gpx></gpx>", "XML, such as GPX, which is not read"),
+        ("t,lat,lon,speed\n0,49,8,46\n1,49.00012,8,46\n2,49.00024,8,46\n", "speed_kmh"),
         ("stamp,latitude,longitude,altitude\n", "holds no GPS fix"),
         ("stamp,latitude,longitude,altitude\n0,95,8,100\n", "line 2: no GPS fix"),
         ("stamp,latitude,longitude,altitude\n0,x,8,100\n", "line 2: no GPS fix"),
@@ -71,3 +73,12 @@ def test_bad_fixes_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture
     (tmp_path / "track").write_text("\n".join(["stamp,latitude,longitude,altitude", *rows, "9,,,"]))
     assert read_gps(tmp_path / "track").stamps.tolist() == [0, 1, 2, 4, 6, 7]
     assert "3 of 9 rows" in caplog.text and "line 5" in caplog.text
+
+
+def test_a_dash_cam_that_gives_no_altitude(tmp_path: Path) -> None:
+    text = "Time,Lat,Lon,Speed (km/h)\n2026-05-03T12:30:05Z,49,8,36\n2026-05-03T12:30:06Z,49.00009,8,\n"
+    track = read_gps(written(tmp_path, text))
+    assert track.stamps.tolist() == [1777811405.0, 1777811406.0]
+    assert track.places[:, :2].tolist() == [[49.0, 8.0], [49.00009, 8.0]]
+    assert np.isnan(track.places[:, 2]).all()
+    np.testing.assert_allclose(track.speeds, [10.0, np.nan])

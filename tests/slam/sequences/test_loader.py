@@ -154,6 +154,16 @@ def test_a_table_of_times_cut_to_match_as_advised(tmp_path: Path, images, camera
     assert len(open_sequence(tmp_path)) == 2
 
 
+def test_times_beside_the_folder_of_images_that_is_named(
+    tmp_path: Path, images, camera_yaml: str
+) -> None:
+    (tmp_path / "images").mkdir()
+    images(tmp_path / "images", ["0.png", "1.png"])
+    (tmp_path / "camera.yaml").write_text(camera_yaml)
+    (tmp_path / "times.txt").write_text("5.0\n5.3\n")
+    assert open_sequence(tmp_path / "images").stamps.tolist() == [5.0, 5.3]
+
+
 def test_a_camera_of_another_size_scaled_as_advised(
     tmp_path: Path, images, camera_yaml: str
 ) -> None:
@@ -212,13 +222,16 @@ def test_opens(tmp_path: Path, camera_64: str, by_folder: bool) -> None:
     assert sequence.provenance() == ("folder/trip[10:20]",)
 
 
-def write_mp4(path: Path, times: list[int], rate: int = 30, rotated: bool = False) -> Path:
+def write_mp4(
+    path: Path, times: list[int], rate: int = 30, rotated: bool = False, aspect: str = "1"
+) -> Path:
     """Grey frames of 64x48 shown at ``times``, in units of 1/600 s; the left half of each is white."""
     av = pytest.importorskip("av")
     with av.open(str(path), "w") as container:
         stream = container.add_stream("mpeg4", rate=rate, options={"bf": "0"})
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
         stream.codec_context.time_base = Fraction(1, 600)
+        stream.codec_context.sample_aspect_ratio = Fraction(aspect)
         for time in times:
             picture = np.full((48, 64, 3), 90, np.uint8)
             picture[:, :32] = 255
@@ -234,6 +247,14 @@ def write_mp4(path: Path, times: list[int], rate: int = 30, rotated: bool = Fals
         assert straight in data[header:]
         path.write_bytes(data[:header] + data[header:].replace(straight, turned, 1))
     return path
+
+
+@pytest.mark.parametrize(("rotated", "ratio"), [(False, 4 / 3), (True, 3 / 4)])
+def test_pixels_of_a_video_that_are_not_square(tmp_path: Path, rotated: bool, ratio: float) -> None:
+    path = write_mp4(tmp_path / "a.mp4", [0, 60, 120, 180], rotated=rotated, aspect="4/3")
+    camera = open_sequence(path, camera=Path("fov=70")).intrinsics
+    assert camera.fy / camera.fx == pytest.approx(ratio)
+    assert camera.width == (48 if rotated else 64)
 
 
 def test_uneven_frame_times_are_used(

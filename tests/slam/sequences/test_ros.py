@@ -387,8 +387,10 @@ def write_euroc(folder: Path, files: list[Path], stamps: list[int], camera: Came
     return folder
 
 
-def write_bag(bag: Any, files: list[Path], stamps: list[int], camera: CameraFile) -> Path:
-    bag.camera_info("/camera/camera_info", camera.pinhole, "plumb_bob", BENT)
+def write_bag(
+    bag: Any, files: list[Path], stamps: list[int], camera: CameraFile, lens: str = "plumb_bob"
+) -> Path:
+    bag.camera_info("/camera/camera_info", camera.pinhole, lens, BENT)
     for path, stamp in zip(files, stamps, strict=True):
         bag.image("/camera/image_raw", stamp, cv2.imread(str(path)), "bgr8", late_ns=3_000_000)
     made: Path = bag.close()
@@ -411,7 +413,7 @@ def test_the_same_frames_are_the_same_sequence(
             write_plain(tmp_path / "plain", files, stamps, camera),
             write_euroc(tmp_path / "euroc", files, stamps, camera),
             write_bag(new_bag("ros1", "one"), files, stamps, camera),
-            write_bag(new_bag("sqlite", "two"), files, stamps, camera),
+            write_bag(new_bag("sqlite", "two"), files, stamps, camera, lens=""),
         ),
     )
     assert plain.intrinsics.undistorted and plain.stamps[0] == pytest.approx(

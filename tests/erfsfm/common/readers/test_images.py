@@ -91,10 +91,11 @@ def test_a_video_behind_a_photo_is_left_out(tmp_path: Path) -> None:
         read_image(path)
 
 
-def test_more_pixels_than_can_be_are_not_taken_from_memory(tmp_path: Path) -> None:
-    """The header of a PNG announces 32000 x 32000."""
+@pytest.mark.parametrize("side", [9_000, 32_000])
+def test_more_pixels_than_can_be_are_not_taken_from_memory(tmp_path: Path, side: int) -> None:
+    """The header of a PNG announces them."""
     _, content = cv2.imencode(".png", np.zeros((8, 8), np.uint8))
-    header = b"IHDR" + struct.pack(">II", 32_000, 32_000) + content.tobytes()[24:29]
+    header = b"IHDR" + struct.pack(">II", side, side) + content.tobytes()[24:29]
     (tmp_path / "a.png").write_bytes(
         content.tobytes()[:12]
         + header

@@ -51,6 +51,13 @@ def test_any_order_gives_the_right_frame(tmp_path: Path, suffix: str, counted_fr
         assert decoded(frames.read(index)) == index
 
 
+def test_a_name_with_colons_is_no_protocol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_video(tmp_path / "drive.mp4").rename("12:30:05.mp4")
+    frames = VideoFrames(Path("12:30:05.mp4"))
+    assert len(frames) == FRAMES and decoded(frames.read(3)) == 3
+
+
 def test_an_uncounted_video_is_decoded_once_in_order(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

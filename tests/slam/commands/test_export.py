@@ -71,7 +71,7 @@ def test_colmap_has_camera_poses_and_cloud(make_run: MakeRun, tmp_path: Path, up
     ] == "1 PINHOLE 416 128 230.0 230.0 207.5 63.5"
     assert len((written / "images.txt").read_text().splitlines()) == 1 + 2 * 300
     third = (written / "points3D.txt").read_text().splitlines()[3]
-    assert third == ("3 0 -2 1 128 128 128 0" if up == "y-down" else "3 0 1 2 128 128 128 0")
+    assert third == ("3 0 -2 1 128 128 128 -1" if up == "y-down" else "3 0 1 2 128 128 128 -1")
     first = [
         float(word) for word in (written / "images.txt").read_text().splitlines()[1].split()[1:8]
     ]

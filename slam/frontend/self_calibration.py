@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
+from erfsfm.common.processes import limit_library_threads
+from erfsfm.common.readers.camera_file import UNKNOWN_FOV_DEG, UNKNOWN_FX_SIGMA, CameraFile
 from slam.frames import Frame
 from slam.frontend.tracking import Search, Texture, are_inside, new_corners, track
 from slam.geometry.multiview import pixel_jacobian, resect, unit_pose_by_essential
@@ -29,7 +31,6 @@ from slam.geometry.robust import mad_sigma, median, weighted_median
 from slam.geometry.se3 import FloatArray, compose, from_rotation_vector, invert, make
 
 MOST_FRAMES = 450
-PRIOR_FOV_DEG, PRIOR_SIGMA = 65.0, 0.35
 SURE, ROUGH = 0.05, 0.12  # relative sigmas below which a focal length is found, or roughly
 _WIDTH_PX = 960  # of the images that are followed
 _SEARCH = Search(side=16, levels=4, limits=(20, 0.02), back=None, error_px=0.5, norm=np.inf)
@@ -40,7 +41,7 @@ _LOST = 0.5  # of the corners of the last keyframe
 _KEYFRAMES, _WINDOWS, _LEAST_KEYFRAMES = 20, 6, 4
 _LEAST_SIGHTINGS = 600  # of a window that counts
 # logarithm of the focal length, both radial coefficients, principal point
-_PRIOR = np.array([-np.log(np.tan(np.deg2rad(PRIOR_FOV_DEG) / 2)), 0.0, 0.0, 0.0, 0.0])
+_PRIOR = np.array([-np.log(np.tan(np.deg2rad(UNKNOWN_FOV_DEG) / 2)), 0.0, 0.0, 0.0, 0.0])
 _PRIOR_SIGMAS = np.array([0.5, 0.15, 0.05, 0.024, 0.024])
 _ALL, _BUT_FOCAL, _NOTHING = 0, 1, 5  # the first of these that is free
 _GUESSES_DEG = 60.0, 85.0
@@ -57,7 +58,7 @@ _HUBER = 1.5
 
 @dataclass(frozen=True)
 class FoundCamera:
-    """A camera by its own images: ``focal`` and ``centre`` in half widths of the image, from its middle; ``radial`` k1 k2.
+    """A camera by its own images: ``focal`` and, from the middle, ``centre`` in half widths; ``radial`` k1 and k2.
 
     ``sigma`` is relative, of the focal length; ``turn_deg`` the largest turn of the axis in one of
     the ``windows`` that tell.
@@ -70,6 +71,20 @@ class FoundCamera:
     windows: int
     turn_deg: float
 
+    def as_file(self, guess: CameraFile, source: str) -> CameraFile:
+        """The camera file in place of a ``guess``, whose size, rate and height hold."""
+        half = guess.width / 2
+        keys: dict[str, Any] = {
+            "fx": round(self.focal * half, 2),
+            "fy": round(self.focal * half, 2),
+            "cx": round(guess.cx + self.centre[0] * half, 2),
+            "cy": round(guess.cy + self.centre[1] * half, 2),
+        }
+        if any(self.radial):
+            first, second = (round(value, 5) for value in self.radial)
+            keys |= {"model": "opencv", "distortion": (first, second, 0.0, 0.0)}
+        return guess.model_copy(update=keys | {"fx_sigma": round(self.sigma, 4), "source": source})
+
     def sentence(self, width: int) -> str:
         """What the user is told of it, for images of this width in pixels."""
         fov_deg = 2.0 * np.rad2deg(np.arctan(1.0 / self.focal))
@@ -79,7 +94,9 @@ class FoundCamera:
                 f"third: turn it once, state fov= or give GPS; fov={fov_deg:.0f} is taken"
             )
         roughly = ", roughly" if self.sigma > SURE else ""
-        windows = "1 window that turns" if self.windows == 1 else f"{self.windows} windows that turn"
+        windows = (
+            "1 window that turns" if self.windows == 1 else f"{self.windows} windows that turn"
+        )
         return (
             f"the focal length is {self.focal * width / 2:.0f} px ± {100 * self.sigma:.1f} % (fov={fov_deg:.0f})"
             f"{roughly}, found from {windows} by up to {self.turn_deg:.0f} degrees"
@@ -88,13 +105,10 @@ class FoundCamera:
 
 def find_camera(frames: Iterable[Frame]) -> FoundCamera:
     """The camera of images of one size, in their order; the prior's with its sigma where it cannot be seen."""
-    seen, pixel = follow(frames)
-    found = []
-    for part in windows_that_turn(seen):
-        window = calibrated(part, pixel)
-        if window is not None:
-            found.append(window)
-    return joined(found)
+    with limit_library_threads():  # the systems are small
+        seen, pixel = follow(frames)
+        windows = [calibrated(part, pixel) for part in windows_that_turn(seen)]
+    return joined(window for window in windows if window is not None)
 
 
 @dataclass(frozen=True)
@@ -118,7 +132,7 @@ class Sightings:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """``T_camera_world`` ``(K, 4, 4)``, the first the identity, homogeneous ``points`` ``(P, 4)`` of length 1, ``lens`` (5,)."""
+    """``T_camera_world`` ``(K, 4, 4)``, the first the identity; homogeneous ``points`` ``(P, 4)``; ``lens`` ``(5,)``."""
 
     T_camera_world: FloatArray
     points: FloatArray
@@ -135,12 +149,14 @@ class Reconstruction:
         R = Rotation.from_rotvec(turns).as_matrix()
         centres = T_world_camera[:, :3, 3] * [1.0, 1.0, ratio]
         T_camera_world = make(R, -np.einsum("kij,kj->ki", R, centres))
-        return Reconstruction(T_camera_world, points, self.lens + np.log(ratio) * (np.arange(5) == 0))
+        return Reconstruction(
+            T_camera_world, points, self.lens + np.log(ratio) * (np.arange(5) == 0)
+        )
 
 
 @dataclass(frozen=True)
 class Window:
-    """What one window says: ``lens`` ``(5,)``, sigma of the first, its ``sightings``, and the largest turn of its axis."""
+    """What one window says: ``lens`` ``(5,)``, ``sigma`` of the first, and the largest turn of its axis."""
 
     lens: FloatArray
     sigma: float
@@ -174,7 +190,9 @@ def follow(frames: Iterable[Frame]) -> tuple[Sightings, float]:
         image = (pixels - [(width - 1) / 2, (height - 1) / 2]) * (2.0 / width)
         rows.append(np.column_stack([np.full(len(ids), len(rows)), ids, image]))
     table = np.concatenate(rows) if rows else np.zeros((0, 4))
-    return Sightings(table[:, 0].astype(np.int64), table[:, 1].astype(np.int64), table[:, 2:]), 2.0 / width
+    return Sightings(
+        table[:, 0].astype(np.int64), table[:, 1].astype(np.int64), table[:, 2:]
+    ), 2.0 / width
 
 
 def windows_that_turn(seen: Sightings) -> list[Sightings]:
@@ -188,7 +206,9 @@ def windows_that_turn(seen: Sightings) -> list[Sightings]:
         aside[k] = aside[k - 1] + (np.median(moved, axis=0) if len(moved) else 0.0)
     count = min(_KEYFRAMES, keyframes)
     starts = range(0, keyframes - count + 1, _KEYFRAMES // 2)
-    turns = [float(np.ptp(aside[start : start + count], axis=0).max(initial=0.0)) for start in starts]
+    turns = [
+        float(np.ptp(aside[start : start + count], axis=0).max(initial=0.0)) for start in starts
+    ]
     windows = []
     for n in np.argsort(turns)[::-1][:_WINDOWS].tolist():
         rows = np.flatnonzero((seen.keyframe >= starts[n]) & (seen.keyframe < starts[n] + count))
@@ -230,14 +250,17 @@ def calibrated(seen: Sightings, pixel: float) -> Window | None:
     start, _ = problem.solved(start, _ALL, sigma, 15)
     turns = Rotation.from_matrix(start.T_camera_world[:, :3, :3]).as_rotvec()
     turn_deg = float(np.rad2deg(np.linalg.norm(turns[:, :2], axis=1).max()))
-    return Window(start.lens, problem.focal_sigma(start, sigma), len(problem.seen), turn_deg, at_end)
+    return Window(
+        start.lens, problem.focal_sigma(start, sigma), len(problem.seen), turn_deg, at_end
+    )
 
 
 def joined(windows: Iterable[Window]) -> FoundCamera:
     """The camera by windows, robustly, and a prior of its focal length; the prior's alone where they say too little."""
     telling = [w for w in windows if w.sightings > _LEAST_SIGHTINGS and not w.at_end]
     values = np.array([*(window.lens[0] for window in telling), _PRIOR[0]])
-    sigmas = np.array([*(np.hypot(_INFLATED * w.sigma, _FLOOR) for w in telling), PRIOR_SIGMA])
+    own_sigmas = [np.hypot(_INFLATED * window.sigma, _FLOOR) for window in telling]
+    sigmas = np.array([*own_sigmas, UNKNOWN_FX_SIGMA])
     centre = weighted_median(values, sigmas**-2)
     for _ in range(10):
         near = np.maximum(np.abs(values - centre) / sigmas, 1e-9)
@@ -247,7 +270,7 @@ def joined(windows: Iterable[Window]) -> FoundCamera:
     sigma = float(np.hypot(np.sqrt(max(1.0, disagree) / weights.sum()), _SYSTEMATIC))
     if not telling or sigma > ROUGH:
         focal = float(np.exp(_PRIOR[0]))
-        return FoundCamera(focal, (0.0, 0.0), (0.0, 0.0), PRIOR_SIGMA, 0, 0.0)
+        return FoundCamera(focal, (0.0, 0.0), (0.0, 0.0), UNKNOWN_FX_SIGMA, 0, 0.0)
     focal, own = float(np.exp(centre)), weights[:-1]
     first, second, x, y = (own @ np.array([w.lens[1:] for w in telling]) / own.sum()).tolist()
     turn_deg = max(window.turn_deg for window in telling)
@@ -376,7 +399,9 @@ class Problem:
             own[n:, at] = own[at, n:].T
             side[at] = np.tensordot(A[rows], error[rows], ([0, 2], [0, 1]))
             W[seen.point[rows], :, at] = B[rows] @ by_camera[rows]
-        own[n:, n:] = np.tensordot(C, by_lens, ([0, 2], [0, 1])) + np.diag(_PRIOR_SIGMAS[first:] ** -2)
+        own[n:, n:] = np.tensordot(C, by_lens, ([0, 2], [0, 1])) + np.diag(
+            _PRIOR_SIGMAS[first:] ** -2
+        )
         from_prior = (given.lens - _PRIOR)[first:] / _PRIOR_SIGMAS[first:] ** 2
         side[n:] = np.tensordot(C, error, ([0, 2], [0, 1])) + from_prior
         V, point_side = np.zeros((len(W), 3, 3)), np.zeros((len(W), 3))
@@ -404,7 +429,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class _System:
-    """Blocks of cameras and lens ``own`` and ``side``, of points ``V``, ``point_side``, between them ``W`` ``(P, 3, n)``."""
+    """Blocks and right sides: ``own`` of cameras and lens, ``V`` of points; ``W`` ``(P, 3, n)`` between them."""
 
     own: FloatArray
     side: FloatArray
@@ -471,7 +496,12 @@ def reconstructed(
 
 
 def _adjusted(
-    seen: Sightings, rays: FloatArray, T: FloatArray, lens: FloatArray, pixel: float, iterations: int
+    seen: Sightings,
+    rays: FloatArray,
+    T: FloatArray,
+    lens: FloatArray,
+    pixel: float,
+    iterations: int,
 ) -> tuple[Problem, Reconstruction]:
     """Of the cameras that are known, with the points that they see."""
     points = _triangulated(seen, rays, T, float(np.exp(lens[0])) / pixel)
@@ -526,7 +556,9 @@ def turning(
     part, kept = seen.chosen(seen.keyframe < len(R), least=2)
     directions = np.zeros((len(kept), 4))
     chosen = rays[np.isin(seen.point, kept) & (seen.keyframe < len(R))]
-    np.add.at(directions[:, :3], part.point, np.einsum("sji,sj->si", np.array(R)[part.keyframe], chosen))
+    np.add.at(
+        directions[:, :3], part.point, np.einsum("sji,sj->si", np.array(R)[part.keyframe], chosen)
+    )
     directions[:, :3] = _normalised(directions[:, :3])
     directions[:, 3] = 0.1
     T = make(np.array(R), 1e-3 * np.random.default_rng(0).normal(size=(len(R), 3)))
@@ -536,11 +568,13 @@ def turning(
 
 
 def _bent(ideal: FloatArray, lens: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Images ``(S, 2)`` through the lens; derivatives by images without ``(S, 2, 2)``, and by the lens ``(S, 2, 5)``."""
+    """Images ``(S, 2)`` through the lens; derivatives by those without ``(S, 2, 2)`` and by the lens ``(S, 2, 5)``."""
     square = (ideal**2).sum(axis=1)[:, None]
     factor = 1.0 + lens[1] * square + lens[2] * square**2
     slope = 2.0 * lens[1] + 4.0 * lens[2] * square
-    by_ideal = factor[:, :, None] * np.eye(2) + slope[:, :, None] * ideal[:, :, None] * ideal[:, None]
+    by_ideal = (
+        factor[:, :, None] * np.eye(2) + slope[:, :, None] * ideal[:, :, None] * ideal[:, None]
+    )
     by_focal = ideal * (factor + slope * square)
     by_centre = np.broadcast_to(np.eye(2), by_ideal.shape)
     radial = np.stack([by_focal, ideal * square, ideal * square**2], axis=2)

@@ -40,12 +40,12 @@ class Intrinsics(Pinhole):
     """A pinhole camera without distortion; (0, 0) is the centre of the top-left pixel.
 
     ``undistorted`` is True where the camera itself has a lens with distortion, and its images are undistorted as they
-    are read; ``is_guess`` where nobody calibrated it. ``readout_s`` is the time from the first row to the last of a
-    rolling shutter.
+    are read; ``focal_sigma`` is relative, of the focal length, 0 where it was calibrated. ``readout_s`` is the time
+    from the first row to the last of a rolling shutter.
     """
 
     undistorted: bool = field(default=False, kw_only=True, compare=False, repr=False)
-    is_guess: bool = field(default=False, kw_only=True, compare=False, repr=False)
+    focal_sigma: float = field(default=0.0, kw_only=True, compare=False, repr=False)
     readout_s: float = field(default=0.0, kw_only=True, repr=False)
 
     @property

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from erfsfm.common.errors import ErfsfmError
 from erfsfm.common.files import refuse_foreign
 from erfsfm.common.progress import Progress, silent
+from erfsfm.common.readers.camera_file import CAMERA_FILE
 from slam.formats.colmap import BINARY_FOLDER, HEADER, MODEL_FILES, Sightings, write_colmap
 from slam.formats.ply import R_UP_WORLD, Ply, read_ply, rotated, write_ply
 from slam.formats.trajectory import Trajectory, nearest_stamps, read_trajectory
@@ -29,7 +30,6 @@ from slam.results.folder import RunFolder, check_replaced
 from slam.results.metrics import CAMERA_HEIGHTS, METRES
 from slam.runtime.errors import RunError, SlamError
 from slam.runtime.files import ESTIMATE, MAP_CLOUD, MAP_MESH, PLACES, write_atomically
-from slam.sequences.camera_file import is_field_of_view
 from slam.sequences.catalogue import open_sequence
 
 logger = logging.getLogger(__name__)
@@ -294,11 +294,9 @@ def _recording(
     place, camera = (
         Path(recorded[name]) if name in recorded else None for name in ("dataset", "camera")
     )
-    if (
-        dataset is not None
-        and camera is not None
-        and not (camera.exists() or is_field_of_view(camera))
-    ):
+    if (found := folder.path / CAMERA_FILE).is_file():
+        camera = found
+    elif dataset is not None and camera is not None and not camera.exists():
         camera = None  # it may have moved with the images
     try:
         sequence = open_sequence(dataset or place, recorded.get("sequence"), camera)

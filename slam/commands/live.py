@@ -27,7 +27,7 @@ from slam.results.folder import RunFolder, check_output, run_log
 from slam.results.report.rerun import Viewer
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_extra
-from slam.sequences.camera_file import as_known, find_camera_file
+from slam.sequences.camera_file import find_camera_file, require_stated
 from slam.sequences.stream import INTERRUPTED, OVER, StreamedSequence, open_source
 
 logger = logging.getLogger(__name__)
@@ -59,6 +59,7 @@ def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
         if request.view:
             import_extra("rerun")
         settings = load_config(request.config, request.overrides or ())
+        require_stated(request.camera)
         source = open_source(request.dataset, request.wait)
         path = Path(request.dataset).absolute()
         folders = (path, path.parent) if path.exists() else ()
@@ -67,7 +68,6 @@ def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
         )
         source.fps, name = camera.fps, Path(without_secrets(request.dataset)).stem or "live"
         sequence = StreamedSequence(name, source, camera, request.wait, request.every_frame)
-        sequence.intrinsics = as_known(sequence.intrinsics, request.camera)
         prediction = open_prediction(
             request.weights, request.device, settings.depth, sequence.intrinsics
         )

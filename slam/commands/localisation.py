@@ -29,7 +29,7 @@ from slam.loops.vocabulary import PlaceIndex
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
 from slam.runtime.files import PLACES
-from slam.sequences.camera_file import beside, explicit_camera, undistorted
+from slam.sequences.camera_file import beside, explicit_camera, require_stated, undistorted
 from slam.sequences.images import ImageFiles
 from slam.sequences.recording import frame_range
 
@@ -96,6 +96,7 @@ def localise(
         SlamError, DataError: no images or none that can be read, no places in the run, a camera file that does not fit,
             or none where the run undistorted its images.
     """
+    require_stated(camera)
     paths = _image_paths(images)
     first, last = frame_range(frames or ":", len(paths))
     places = Places.read(run.require(PLACES))

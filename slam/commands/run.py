@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import yaml
 from pydantic import BeforeValidator, Field, ValidationError
 
 from erfsfm import __version__
@@ -18,6 +19,7 @@ from erfsfm.common.errors import explained, without_secrets
 from erfsfm.common.files import FolderLock
 from erfsfm.common.processes import limit_library_threads
 from erfsfm.common.progress import Progress, progress_bar, progress_lines, silent
+from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile
 from erfsfm.common.signals import raising_on_termination
 from erfsfm.inference import commit
 from slam.config.sections import SlamConfig, dump_yaml, load_config
@@ -26,10 +28,11 @@ from slam.formats.ply import Ply
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image
 from slam.frames import Sequence as FrameSequence
+from slam.frontend.self_calibration import MOST_FRAMES, find_camera
 from slam.mapping.depth import KeyframeDepth
 from slam.mapping.surface import MapSurface
 from slam.pipeline.estimate import Estimate
-from slam.pipeline.run import Recorder, SlamPipeline
+from slam.pipeline.run import Recorder, SlamPipeline, read_frame
 from slam.prediction.assembly import Prediction, open_prediction
 from slam.prediction.depth_source import FrameNumbers
 from slam.results.estimate_metrics import estimate_metrics, lidar_trajectory, timing_of
@@ -44,7 +47,14 @@ from slam.results.report.page import (
 )
 from slam.results.report.rerun import write_rerun
 from slam.results.truth_errors import DepthQuality, map_errors
-from slam.runtime.errors import EmptyMapError, Failed, RunError, SlamError, attempt
+from slam.runtime.errors import (
+    EmptyMapError,
+    Failed,
+    MissingCameraError,
+    RunError,
+    SlamError,
+    attempt,
+)
 from slam.runtime.files import (
     CONFIG,
     GRAPH,
@@ -57,8 +67,10 @@ from slam.runtime.files import (
     source_from_anywhere,
 )
 from slam.runtime.imports import import_extra
+from slam.sequences.camera_file import AUTO, is_auto
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.gps_track import read_gps
+from slam.sequences.recording import RecordedSequence
 
 logger = logging.getLogger(__name__)
 
@@ -310,9 +322,7 @@ def perform(request: RunRequest) -> RunFolder:
         if request.rerun is not None:
             import_extra("rerun")
         settings = load_config(request.config, request.overrides or ())
-        recording = open_sequence(
-            request.dataset, request.sequence, request.camera, request.frames, request.truth
-        )
+        recording = open_recording(request)
         lens, camera = recording.undistortion, recording.intrinsics
         # by which files of depth are found
         numbers = FrameNumbers(len(recording), recording.start, recording.recorded)
@@ -327,6 +337,9 @@ def perform(request: RunRequest) -> RunFolder:
         )
         pipeline.require_possible()
         folder = RunFolder.create(request.output, Path(settings.output.root), recording.name, lock)
+        if isinstance(recording.camera, CameraFile) and recording.camera.fx_sigma:
+            keys = recording.camera.model_dump(mode="json")
+            folder.write(CAMERA_FILE, yaml.safe_dump(keys, sort_keys=False, width=1000))
         recorder = FolderRecorder(
             folder, pipeline, settings, provenance_of(request, prediction, recording), progress
         )
@@ -334,6 +347,43 @@ def perform(request: RunRequest) -> RunFolder:
         if request.rerun is not None:
             write_rerun(request.rerun, estimate, pipeline.sequence.intrinsics)
     return folder
+
+
+def open_recording(request: RunRequest) -> RecordedSequence:
+    """The recording; a camera that nobody states is found by its own images, and said in one line.
+
+    Raises:
+        SequenceError: as `open_sequence`.
+    """
+    asked = request.camera
+
+    def opened(camera: Path | None) -> RecordedSequence:
+        given = request.dataset, request.sequence, camera, request.frames, request.truth
+        return open_sequence(*given)
+
+    try:
+        recording = opened(asked)
+    except MissingCameraError:
+        asked = AUTO
+        recording = opened(asked)
+    camera = recording.camera
+    if asked is None or not is_auto(asked) or not isinstance(camera, CameraFile):
+        return recording
+    total = min(len(recording), MOST_FRAMES)
+
+    def frames() -> Iterator[Frame]:
+        for index in range(total):
+            request.progress("camera", index, total)
+            frame = read_frame(recording, index)
+            if isinstance(frame, Frame):
+                yield frame
+        request.progress("camera", total, total)
+
+    found = find_camera(frames())
+    said = found.sentence(camera.width)
+    logger.warning("%s", said)
+    recording.take_camera(found.as_file(camera, said), recording.camera_height_m)
+    return recording
 
 
 def record(

@@ -11,9 +11,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import erf
 
 from slam.frames import Ends, Intrinsics, RelativePose, runs
 from slam.frontend.drive import Drive, named
+from slam.frontend.self_calibration import SURE
 from slam.frontend.visual.motion import Motion, triangulated
 from slam.frontend.visual.self_calibration import DepthError, FocalLength
 from slam.geometry.robust import mad_sigma
@@ -44,6 +46,8 @@ _ASIDE_SPREAD = 0.01
 _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS = 0.03, 3.0
 # of `share_right`, by tools/fit_confidence.py of commit 669cc2b1
 CONFIDENCE = (0.97, 3.0, 5.5)
+# of a path along a road that is stretched, the error over the path and the stretch
+_STRETCHED = 0.29
 _CAPPED = 3.0  # sigmas of what leaves a confidence of less than a half
 
 
@@ -249,23 +253,24 @@ def _overlap(support: FloatArray) -> tuple[float, str]:
 
 
 def of_focal_length(found: FocalLength, camera: Intrinsics) -> Agreement | None:
-    """By the focal length that corners show; None where they show too little. A guess is a doubt in any case."""
+    """By the focal length that corners show; None where they show too little. A rough guess is a doubt in any case."""
     logarithm, sigma = found.error or (0.0, np.inf)
     sigmas = abs(logarithm) / float(np.hypot(_FOCAL, sigma))
-    figure = "nobody calibrated it" if camera.is_guess else ""
+    is_guess = camera.focal_sigma > SURE
+    figure = "nobody calibrated it" if is_guess else ""
     if sigma < _TELLING_FOCAL or sigmas > DOUBTFUL:
         figure += f"{', ' if figure else ''}measured from corners it is {100 * np.exp(logarithm):.0f} % of the given"
         figure += f", give or take {100 * sigma:.0f} %"
         if sigmas > DOUBTFUL:
             fov = 2.0 * np.arctan(camera.width / (2.0 * camera.fx * np.exp(logarithm)))
             figure += f": try fov={np.rad2deg(fov):.0f}"
-    if camera.is_guess:
+    if is_guess:
         return Agreement("the guessed focal length", max(sigmas, _CAPPED), figure, "good drives")
     return Agreement("the focal length", sigmas, figure) if figure else None
 
 
 def confidence(
-    agreements: Iterable[Agreement], is_metric: bool, is_carried: bool
+    agreements: Iterable[Agreement], is_metric: bool, is_carried: bool, focal_sigma: float = 0.0
 ) -> float | Failed:
     """The share of drives with as large a contradiction that err by at most 1 % of their path.
 
@@ -273,6 +278,7 @@ def confidence(
         agreements: of all sources of the drive.
         is_metric: whether lengths are in metres.
         is_carried: whether a person carries the camera.
+        focal_sigma: relative, of a focal length that nobody calibrated: it stretches the road.
 
     Returns:
         A failure for drives of which it is not known.
@@ -281,7 +287,9 @@ def confidence(
         return Failed("it is calibrated on roads, not for a camera that is carried")
     if not is_metric:
         return Failed("it is calibrated for lengths in metres")
-    return float(share_right(max((each.sigmas for each in agreements), default=0.0), CONFIDENCE))
+    share = float(share_right(max((each.sigmas for each in agreements), default=0.0), CONFIDENCE))
+    stretched = _STRETCHED * np.sqrt(2.0) * focal_sigma
+    return min(share, float(erf(0.01 / stretched))) if stretched else share
 
 
 def share_right(sigmas: FloatArray | float, constants: tuple[float, float, float]) -> FloatArray:

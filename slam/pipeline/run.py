@@ -387,7 +387,8 @@ class SlamPipeline:
         if not drive.maps:
             of_images.append(agreement.of_directions(odometry.T_world_camera))
         trusted = [*(each for each in by_sources if not each.is_wrong), *of_images]
-        sure = agreement.confidence(trusted, scale.is_metric, bool(drive.maps))
+        focal_sigma = self.sequence.intrinsics.focal_sigma
+        sure = agreement.confidence(trusted, scale.is_metric, bool(drive.maps), focal_sigma)
         return [*by_sources, *of_images], sure
 
     @cached_property

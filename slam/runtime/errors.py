@@ -26,6 +26,10 @@ class SequenceError(SlamError):
     """A sequence is missing, incomplete or malformed."""
 
 
+class MissingCameraError(SequenceError):
+    """Nobody says which camera took the images of a sequence."""
+
+
 class MissingFrameError(SequenceError):
     """A frame whose number is missing from the files of a sequence: a gap in time, which is interpolated."""
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from erfsfm.common import files
+from erfsfm.common.readers.camera_file import CAMERA_FILE
 from slam.runtime.errors import SlamError
 
 CONFIG = "config.yaml"
@@ -37,6 +38,7 @@ ESTIMATE = trajectory_file("optimised", "tum")  # a folder that holds it holds a
 
 MEANINGS = {
     CONFIG: "resolved configuration",
+    CAMERA_FILE: "camera without a calibration, as found",
     METRICS: "every number of this page",
     GRAPH: "pose graph",
     LOOPS: "accepted and rejected loops",

@@ -22,17 +22,26 @@ import numpy as np
 from erfsfm.common.config_tree import parse_yaml
 from erfsfm.common.errors import DataError, ErfsfmError
 from erfsfm.common.files import read_text
-from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile, camera_of, read_camera_file
+from erfsfm.common.readers.camera_file import (
+    CAMERA_FILE,
+    UNKNOWN_FOV_DEG,
+    UNKNOWN_FX_SIGMA,
+    CameraFile,
+    camera_of,
+    read_camera_file,
+)
 from erfsfm.common.readers.images import read_image
 from slam.frames import DepthMap, Image, Intrinsics, Mask, sampled_depth
 from slam.geometry.se3 import FloatArray
-from slam.runtime.errors import SequenceError
+from slam.runtime.errors import MissingCameraError, SequenceError
 from slam.sequences.images import Sized
 
 logger = logging.getLogger(__name__)
 
 DEFAULT_FPS = 10.0
-_FOV = re.compile(r"fov=(?P<fov>\d+\.?\d*)(?:,fps=(?P<fps>\d+\.?\d*))?")
+AUTO = Path("auto")
+_WORD = re.compile(r"auto|(fov|height|fps)=(\d+\.?\d*)")
+_STATED_FX_SIGMA = 0.1  # relative, by a field of view that the user states
 _ORB_COEFFICIENT = re.compile(r"Camera1?\.[kp]\d")
 _FOV_LIMITS_DEG = (3.0, 150.0)
 
@@ -82,7 +91,7 @@ def find_camera_file(
     """The camera given by the user, or else the recording's own, or the first ``camera.yaml`` found in ``folders``.
 
     Args:
-        explicit: a ``camera.yaml``, or ``fov=DEGREES[,fps=RATE]``.
+        explicit: a ``camera.yaml``, or ``fov=DEGREES`` or ``auto`` and more words (`explicit_camera`).
         folders: where a ``camera.yaml`` may lie; where there is a calibration of the recording's own, it gives the
             height of the camera, its read-out and mask alone.
         wanted_by: what needs it, for the message.
@@ -91,7 +100,7 @@ def find_camera_file(
         own: reads the calibration of the recording, where it has one; not called where the user gave another.
 
     Raises:
-        SequenceError: no camera was given and none is found, or what was given is none.
+        SequenceError: what was given is none; `MissingCameraError` where none was given and none is found.
         DataError: a camera file that is found is malformed.
     """
     if explicit is not None:
@@ -105,47 +114,45 @@ def find_camera_file(
         return camera
     places = " and ".join(dict.fromkeys(str(folder) for folder in folders))
     looked = f"looked in {places}; put one there or " if places else ""
-    raise SequenceError(
+    raise MissingCameraError(
         f"no {CAMERA_FILE} for {wanted_by}: {looked}give it with --camera (width, height, fx, fy, cx, cy, fps), or "
-        "give the horizontal field of view in degrees, --camera fov=70"
+        "give the horizontal field of view in degrees, --camera fov=70; run finds it where the camera turns"
     )
 
 
 def explicit_camera(given: Path, images: Sized, fps: float | None = None) -> CameraFile:
     """The camera that the user named; arguments as in `find_camera_file`.
 
-    That of a field of view is a pinhole with its principal point in the middle; pixels are square unless a video
-    says otherwise.
+    That of words on one line, as ``fov=60,height=1.4,fps=15``, is a pinhole with its principal point in the middle and
+    square pixels, unless a video says otherwise; without ``fov`` it is what is usual, until the camera is found.
 
     Raises:
         SequenceError: there is no such file, or the field of view is impossible.
         DataError: the file is malformed, or its lens is unknown.
     """
-    if not is_field_of_view(given):
+    if not _is_line(given):
         return read_explicit(given, fps)
-    match = _FOV.fullmatch(str(given))
-    fov_deg = float(match["fov"]) if match else math.nan
-    fps = float(match["fps"]) if match and match["fps"] else fps or DEFAULT_FPS
+    matches = [_WORD.fullmatch(word) for word in str(given).split(",")]
+    values = {match[1]: float(match[2]) for match in matches if match and match[1]}
+    fov_deg, fps = values.get("fov", UNKNOWN_FOV_DEG), values.get("fps", fps or DEFAULT_FPS)
     least, most = _FOV_LIMITS_DEG
-    if not (least <= fov_deg <= most and fps > 0):
+    if not (all(matches) and least <= fov_deg <= most and fps > 0):
         raise SequenceError(
             f"{given} is no field of view: write fov=70 for 70 degrees from the left edge of the image to the "
-            f"right, {least:g} to {most:g}, or fov=70,fps=30 for 30 frames a second as well"
+            f"right, {least:g} to {most:g}, or auto; and with it, fov=70,height=1.4,fps=30, the metres above the road "
+            "and the frames a second"
         )
-    width, height, source = (
-        images.width,
-        images.height,
-        f"a horizontal field of view of {fov_deg:g} degrees",
-    )
+    width, height = images.width, images.height
     aspect = getattr(images, "pixel_aspect", 1.0)
     if aspect != 1.0:
         logger.warning("pixels are %.3g times as wide as high, as the video says", aspect)
     focal_px = width / 2 / math.tan(math.radians(fov_deg) / 2)
     centre = (width - 1) / 2, (height - 1) / 2
-    return camera_of(
-        pinhole_keys(width, height, focal_px, aspect * focal_px, *centre, fps=fps, source=source),
-        str(given),
-    )
+    keys = pinhole_keys(width, height, focal_px, aspect * focal_px, *centre)
+    keys |= {"fps": fps, "camera_height_m": values.get("height")}
+    keys |= {"fx_sigma": UNKNOWN_FX_SIGMA if is_auto(given) else _STATED_FX_SIGMA}
+    source = f"a horizontal field of view of {fov_deg:g} degrees"
+    return camera_of({**keys, "source": source}, str(given))
 
 
 def read_explicit(path: Path, fps: float | None = None) -> CameraFile:
@@ -168,14 +175,27 @@ def beside(*folders: Path, own: Mapping[str, Any] | None = None) -> CameraFile |
     return None if path is None else read_camera_file(path, own)
 
 
-def as_known(intrinsics: Intrinsics, asked: Path | None) -> Intrinsics:
-    """The same camera; a guess where the user gave a field of view alone."""
-    return replace(intrinsics, is_guess=asked is not None and is_field_of_view(asked))
+def is_auto(given: Path) -> bool:
+    """Whether the user wants the camera to be found by its own images."""
+    return _is_line(given) and "fov=" not in str(given)
 
 
-def is_field_of_view(given: Path) -> bool:
-    """Whether the user named a field of view, not a file."""
-    return str(given).startswith("fov=")
+def require_stated(given: Path | None) -> None:
+    """Refuse a camera that has to be found first.
+
+    Raises:
+        SequenceError: the user named no file and no field of view.
+    """
+    if given is not None and is_auto(given):
+        raise SequenceError(
+            f"--camera {given} finds the camera of a whole recording: give fov=70 here, or the {CAMERA_FILE} of a run"
+        )
+
+
+def _is_line(given: Path) -> bool:
+    """Whether the user wrote a camera on one line, not the name of a file."""
+    first, *_ = str(given).split(",")
+    return first == str(AUTO) or first.partition("=")[0] in ("fov", "height", "fps")
 
 
 def _read_foreign(path: Path, fps: float) -> CameraFile | None:
@@ -353,6 +373,7 @@ class Undistortion:
             camera.cx,
             camera.cy,
             undistorted=True,
+            focal_sigma=camera.fx_sigma,
             readout_s=readout_s,
         )
         pixels = self.intrinsics.pixel_grid()
@@ -462,7 +483,9 @@ def undistorted(camera: CameraFile) -> tuple[Intrinsics, Undistortion | None]:
     if camera.is_distorted:
         undistortion = Undistortion(camera)
         return undistortion.intrinsics, undistortion
-    return replace(Intrinsics.of(camera.pinhole), readout_s=camera.readout_ms / 1e3), None
+    pinhole = Intrinsics.of(camera.pinhole)
+    readout_s = camera.readout_ms / 1e3
+    return replace(pinhole, readout_s=readout_s, focal_sigma=camera.fx_sigma), None
 
 
 def fixed_to(camera: CameraFile, undistortion: Undistortion | None) -> Mask | None:

@@ -29,7 +29,6 @@ from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError, sequence_errors
 from slam.runtime.imports import import_plug_in, plug_ins
 from slam.sequences import kitti, layouts, ros
-from slam.sequences.camera_file import as_known
 from slam.sequences.images import ReadImages
 from slam.sequences.loader import IMAGES, VIDEO, Asked, Loader, Opener
 from slam.sequences.poses import read_truth
@@ -89,7 +88,7 @@ def open_sequence(
             ``$KITTI_ODOMETRY``. Without it, a name is searched in ``$KITTI_ODOMETRY``; without either, the embedded
             simulated sequence is opened.
         name: which sequence of ``dataset``; optional where there is one only.
-        camera: a ``camera.yaml``, or ``fov=DEGREES``; it replaces the calibration of the data set.
+        camera: a ``camera.yaml``, or ``fov=DEGREES`` and more; it replaces the calibration of the data set.
         frames: ``A:B``, half-open, as Python reads a slice.
         truth: its true poses, in place of those that the data set has.
 
@@ -105,7 +104,6 @@ def open_sequence(
     else:
         root = _root(dataset, name)
         sequence = _choose(root, Asked(name, camera))
-        sequence.intrinsics = as_known(sequence.intrinsics, camera)
     if truth is not None:
         sequence.take_truth(read_truth(truth, sequence.stamps))
     return sequence if frames is None else sequence.cut(*frame_range(frames, len(sequence)))

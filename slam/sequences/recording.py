@@ -104,10 +104,7 @@ class RecordedSequence:
             where = f"{self.name} in {self.images.files.paths[0].parent}"
         if isinstance(self.camera, CameraFile):
             require_size(self.images, self.camera, where)
-            self.intrinsics, self.undistortion = undistorted(self.camera)
-            self.fixed = fixed_to(self.camera, self.undistortion)
-            self.camera_height_m = self.camera.height_or(usual_height_m)
-            self.depth_maps = self.depth_maps if self.undistortion is None else {}
+            self.take_camera(self.camera, usual_height_m)
         else:
             self.intrinsics, self.camera_height_m = self.camera, usual_height_m
         _require_plausible_rate(self.name, self.stamps)
@@ -117,6 +114,13 @@ class RecordedSequence:
             )
         self.recorded = len(self.stamps)
         self.take_truth(self.T_any_camera)
+
+    def take_camera(self, camera: CameraFile, usual_height_m: float | None) -> None:
+        """Let this camera have taken the images, which are of its size."""
+        self.camera, self.camera_height_m = camera, camera.height_or(usual_height_m)
+        self.intrinsics, self.undistortion = undistorted(camera)
+        self.fixed = fixed_to(camera, self.undistortion)
+        self.depth_maps = self.depth_maps if self.undistortion is None else {}
 
     def cut(self, start: int, stop: int) -> Self:
         """The frames [start, stop) as a sequence of their own; stamps stay, poses begin at the identity.

@@ -18,6 +18,8 @@ CAMERA_FILE = "camera.yaml"
 logger = logging.getLogger(__name__)
 
 HIGHEST_M = 100.0  # a camera that sees a road; heights in centimetres are beyond
+# horizontal field of view, degrees, and relative sigma of the focal length of a camera of which nothing is known
+UNKNOWN_FOV_DEG, UNKNOWN_FX_SIGMA = 65.0, 0.35
 _USUAL_HEIGHTS_M = (0.1, 10.0)
 _COEFFICIENTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,), "fov": (1,)}
 
@@ -62,6 +64,9 @@ class CameraFile(BaseModel):
     mask: str | None = Field(
         default=None,
         description="an image of the same size beside this file: white shows the world, black the bonnet or a caption",
+    )
+    fx_sigma: float = Field(
+        default=0.0, ge=0, lt=1, description="relative sigma of fx; 0 of a calibration"
     )
     source: str | None = Field(default=None, description="a note on where the numbers come from")
 

@@ -294,8 +294,8 @@ def _recording(
     place, camera = (
         Path(recorded[name]) if name in recorded else None for name in ("dataset", "camera")
     )
-    if (found := folder.path / CAMERA_FILE).is_file():
-        camera = found
+    if (camera_found := folder.path / CAMERA_FILE).is_file():
+        camera = camera_found
     elif dataset is not None and camera is not None and not camera.exists():
         camera = None  # it may have moved with the images
     try:
@@ -306,7 +306,8 @@ def _recording(
         ) from error
     own = Places.read(folder.require(PLACES)).intrinsics
     expected, found = (
-        (c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in (own, sequence.intrinsics)
+        (each.width, each.height, each.fx, each.fy, each.cx, each.cy)
+        for each in (own, sequence.intrinsics)
     )
     if not np.allclose(expected, found, atol=_SAME_PIXEL):
         raise RunError(

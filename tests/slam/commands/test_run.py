@@ -14,11 +14,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from safetensors.torch import load_file, save_file
 
 from erfsfm.common.errors import BusyError
+from erfsfm.common.readers.camera_file import CAMERA_FILE, UNKNOWN_FX_SIGMA, read_camera_file
 from erfsfm.common.signals import Terminated
 from slam import run_slam
 from slam.commands.cli import main
@@ -249,6 +251,22 @@ def call(*arguments: object) -> int:
         patch.setattr(sys, "argv", ["erfsfm-slam", *map(str, arguments)])
         main()
     return int(stopped.value.code or 0)
+
+
+def test_images_without_a_camera_leave_one_for_the_next_run(
+    quick: dict[str, Any], kitti_root: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    shutil.copytree(kitti_root / "sequences" / "sim" / "image_2", tmp_path / "walk" / "images")
+    given = quick | {"dataset": tmp_path / "walk", "sequence": None}
+    found = run_slam(**given, output=tmp_path / "first").path / CAMERA_FILE
+    camera = read_camera_file(found)
+    assert camera.fx == pytest.approx(camera.width / 2 / np.tan(np.deg2rad(65) / 2), abs=0.01)
+    assert camera.fx_sigma == UNKNOWN_FX_SIGMA and camera.source is not None
+    assert camera.source in caplog.text and "cannot be seen" in camera.source
+    caplog.clear()
+    again = run_slam(**given, camera=found, output=tmp_path / "second")
+    assert "cannot be seen" not in caplog.text
+    assert read_camera_file(again.path / CAMERA_FILE) == camera
 
 
 def test_an_unknown_argument_is_named() -> None:

@@ -97,7 +97,7 @@ def driven(
     focal: float = 0.0,
     aside: int = 0,
     weak: int = 0,
-    is_guess: bool = False,
+    focal_sigma: float = 0.0,
 ) -> float:
     """The confidence of a drive by its images."""
     poses = [RelativePose(k, k + 1, T, np.full(6, 0.01), "essential") for k, T in enumerate(STEPS)]
@@ -111,7 +111,7 @@ def driven(
         segments=[Segment(k, k, "another place") for k in range(segments)],
         focal_length=FocalLength(1e6, -1e6 * focal),
     )
-    camera = replace(CAMERA, is_guess=is_guess)
+    camera = replace(CAMERA, focal_sigma=focal_sigma)
     ends = [pose.ends for pose in poses[:contradicted]]
     found = agreement.of_images(drive, camera, ends, needs_road=True)
     steps = STEPS.copy()
@@ -133,7 +133,7 @@ def driven(
         {"focal": np.log(1.3)},
         {"aside": 8},
         {"weak": 10},
-        {"is_guess": True},
+        {"focal_sigma": 0.1},
     ],
     ids=str,
 )
@@ -147,7 +147,7 @@ def test_a_guessed_focal_length_comes_with_the_one_that_corners_show() -> None:
     sigma = 0.02
     information = (4.0 / sigma) ** 2
     found = FocalLength(information, -information * np.log(CAMERA.fx / 300.0))
-    guess = replace(CAMERA, fx=300.0, fy=300.0, is_guess=True)
+    guess = replace(CAMERA, fx=300.0, fy=300.0, focal_sigma=0.1)
     said = agreement.of_focal_length(found, guess)
     assert said is not None
     true_fov = np.rad2deg(2 * np.arctan(CAMERA.width / (2 * CAMERA.fx)))
@@ -157,6 +157,12 @@ def test_a_guessed_focal_length_comes_with_the_one_that_corners_show() -> None:
 def test_a_focal_length_that_nothing_measured_speaks_for_no_camera() -> None:
     information = (4.0 / 0.25) ** 2
     assert agreement.of_focal_length(FocalLength(information, 0.01 * information), CAMERA) is None
+
+
+@pytest.mark.parametrize(("sigma", "most"), [(0.03, 0.75), (0.06, 0.43), (0.35, 0.08)])
+def test_an_uncertain_focal_length_stretches_the_road(sigma: float, most: float) -> None:
+    sure = agreement.confidence([], is_metric=True, is_carried=False, focal_sigma=sigma)
+    assert sure == pytest.approx(most, abs=0.02)
 
 
 @pytest.mark.parametrize(("is_metric", "is_carried"), [(False, False), (True, True)])

@@ -13,7 +13,7 @@ from slam.simulation.kitti_layout import simulated_world
 from slam.simulation.options import SimulationOptions
 
 WIDTH = 416
-STREET = SimulationOptions(route="loop", frames=250, seed=11, width=WIDTH, height=160)
+STREET = SimulationOptions(route="loop", frames=250, seed=11, width=WIDTH, height=128)
 
 
 def images(options: SimulationOptions, first: int, last: int) -> Iterator[Frame]:
@@ -24,7 +24,7 @@ def images(options: SimulationOptions, first: int, last: int) -> Iterator[Frame]
 
 def test_a_street_that_turns_shows_its_focal_length() -> None:
     true_focal = simulated_world(STREET).camera.fx / (WIDTH / 2)
-    found = find_camera(images(STREET, 30, 80))
+    found = find_camera(images(STREET, 40, 74))
     assert found.focal == pytest.approx(true_focal, rel=0.04)
     assert found.sigma < 0.05 and found.turn_deg > 20
     said = found.sentence(WIDTH)
@@ -32,8 +32,8 @@ def test_a_street_that_turns_shows_its_focal_length() -> None:
 
 
 def test_a_straight_street_says_that_it_cannot_be_seen() -> None:
-    straight = SimulationOptions(route="straight", frames=40, seed=11, width=WIDTH, height=160)
-    found = find_camera(images(straight, 0, 40))
+    straight = SimulationOptions(route="straight", frames=28, seed=11, width=WIDTH, height=128)
+    found = find_camera(images(straight, 0, 28))
     assert found.sigma == UNKNOWN_FX_SIGMA
     assert "cannot be seen: the camera does not turn" in found.sentence(WIDTH)
     assert "fov=65 is taken" in found.sentence(WIDTH)

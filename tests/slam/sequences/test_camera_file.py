@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.camera_file import CameraFile
+from erfsfm.common.readers.camera_file import UNKNOWN_FX_SIGMA, CameraFile
 from slam.frames import Intrinsics
 from slam.runtime.errors import SequenceError
-from slam.sequences.camera_file import Undistortion, find_camera_file, read_explicit
+from slam.sequences.camera_file import Undistortion, find_camera_file, read_explicit, require_stated
 
 IMAGES = Intrinsics(40, 24, 30, 30, 20, 12)
 WIDTH, HEIGHT = 320, 240
@@ -62,6 +62,23 @@ def test_a_horizontal_field_of_view_is_a_camera(tmp_path: Path) -> None:
         find_camera_file(Path("fov=90"), tmp_path, wanted_by="images", images=IMAGES, fps=30).fps
         == 30
     )
+
+
+def test_a_whole_camera_on_one_line(tmp_path: Path) -> None:
+    camera = find_camera_file(
+        Path("fov=90,height=1.4,fps=15"), tmp_path, wanted_by="images", images=IMAGES
+    )
+    assert (camera.camera_height_m, camera.fps) == (1.4, 15)
+    assert camera.fx == pytest.approx(20) and camera.fx_sigma == 0.1
+    for words in ("auto", "auto,height=1.4", "height=1.4"):
+        unknown = find_camera_file(Path(words), wanted_by="images", images=IMAGES)
+        assert unknown.fx_sigma == UNKNOWN_FX_SIGMA
+        with pytest.raises(SequenceError, match=r"give fov=70 here, or the camera\.yaml of a run"):
+            require_stated(Path(words))
+    require_stated(Path("fov=90,height=1.4"))
+    for wrong in ("fov=90,width=3", "fov=900", "fov=90,fps=0", "auto,height"):
+        with pytest.raises(SequenceError, match="is no field of view: write fov=70"):
+            find_camera_file(Path(wrong), wanted_by="images", images=IMAGES)
 
 
 KALIBR = """cam0:

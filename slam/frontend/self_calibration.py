@@ -12,36 +12,26 @@ not move with the focal length.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
+from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from erfsfm.common.processes import limit_library_threads
 from erfsfm.common.readers.camera_file import UNKNOWN_FOV_DEG, UNKNOWN_FX_SIGMA, CameraFile
 from slam.frames import Frame
-from slam.frontend.tracking import Search, Texture, are_inside, new_corners, track
+from slam.frontend.tracking import Sightings, follow
 from slam.geometry.multiview import pixel_jacobian, rotation_between
-from slam.geometry.robust import mad_sigma, median, weighted_median
+from slam.geometry.robust import mad_sigma, weighted_median
 from slam.geometry.se3 import FloatArray, compose, from_rotation_vector, invert, make
 
 MOST_FRAMES = 450
 SURE, ROUGH = 0.05, 0.12  # relative sigmas below which a focal length is found, or roughly
-_WIDTH_PX = 960  # of the images that are followed
-# corners of plain walls creep, and windows beyond the border slip: both bend the focal length by 3 %
-_SEARCH = Search(
-    side=16, levels=4, limits=(20, 0.02), back=None, error_px=0.5, norm=np.inf, texture=1e-4
-)
-_BORDER_PX = 8.0
-_TEXTURE = Texture(quality=0.01, spacing_px=10.0, block_px=5)
-_CORNERS = 500
-_MOVED = 0.06  # of half the width, from keyframe to keyframe
-_LOST = 0.5  # of the corners of the last keyframe
 _KEYFRAMES, _WINDOWS, _LEAST_KEYFRAMES = 20, 6, 4
 _LEAST_SIGHTINGS = 600  # of a window that counts
 # logarithm of the focal length, both radial coefficients, principal point
@@ -57,6 +47,7 @@ _WIDEST_DEG, _NARROWEST_DEG = 125.0, 32.0  # ends of a profile
 _RATIO, _MOST_RISE = 1.15, 30.0  # of its steps, and of its cost above the least
 _CAUCHY = 4.0  # squared sigmas
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-4, 1e-11
+_TRIALS, _LEAST_GAIN = 6, 1e-5  # of a step, and of the cost
 _FARTHEST_STEP, _SETTLED = 0.4, 0.002  # of the logarithm of the focal length
 _TURNING = 0.5  # radians beyond which turns are told without the focal length
 # the formal sigma of a window is several times too small, and rectified images keep an error of their lens
@@ -82,16 +73,12 @@ class FoundCamera:
     def as_file(self, guess: CameraFile, source: str) -> CameraFile:
         """The camera file in place of a ``guess``, whose size, rate and height hold."""
         half = guess.width / 2
-        keys: dict[str, Any] = {
-            "fx": round(self.focal * half, 2),
-            "fy": round(self.focal * half, 2),
-            "cx": round(guess.cx + self.centre[0] * half, 2),
-            "cy": round(guess.cy + self.centre[1] * half, 2),
-        }
-        if any(self.radial):
-            first, second = (round(value, 5) for value in self.radial)
-            keys |= {"model": "opencv", "distortion": (first, second, 0.0, 0.0)}
-        return guess.model_copy(update=keys | {"fx_sigma": round(self.sigma, 4), "source": source})
+        focal, cx, cy = (round(half * value, 2) for value in (self.focal, *self.centre))
+        keys = {"fx": focal, "fy": focal, "cx": guess.cx + cx, "cy": guess.cy + cy}
+        distortion = *(round(value, 5) for value in self.radial), 0.0, 0.0
+        lens = {"model": "opencv", "distortion": distortion}
+        told = {"fx_sigma": round(self.sigma, 4), "source": source}
+        return guess.model_copy(update=keys | lens | told)
 
     def sentence(self, width: int) -> str:
         """What the user is told of it, for images of this width in pixels."""
@@ -102,12 +89,9 @@ class FoundCamera:
                 f"third: turn it once, state fov= or give GPS; fov={fov_deg:.0f} is taken"
             )
         roughly = ", roughly" if self.sigma > SURE else ""
-        windows = (
-            "1 window that turns" if self.windows == 1 else f"{self.windows} windows that turn"
-        )
         return (
             f"the focal length is {self.focal * width / 2:.0f} px ± {100 * self.sigma:.1f} % (fov={fov_deg:.0f})"
-            f"{roughly}, found from {windows} by up to {self.turn_deg:.0f} degrees"
+            f"{roughly}, found from {self.windows} windows that turn by up to {self.turn_deg:.0f} degrees"
         )
 
 
@@ -116,33 +100,7 @@ def find_camera(frames: Iterable[Frame]) -> FoundCamera:
     with limit_library_threads():  # the systems are small
         seen, pixel = follow(frames)
         windows = [calibrated(part, pixel) for part in windows_that_turn(seen)]
-    return joined(window for window in windows if window is not None)
-
-
-@dataclass(frozen=True)
-class Sightings:
-    """``S`` sightings: rows of keyframes and points ``(S,)``, ``image`` ``(S, 2)`` in half widths from the middle."""
-
-    keyframe: NDArray[np.int64]
-    point: NDArray[np.int64]
-    image: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.keyframe)
-
-    def shared(self, keyframe: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows of the points that the keyframe before shows as well, in that and in this one."""
-        before = np.flatnonzero(self.keyframe == keyframe - 1)
-        own = np.flatnonzero(self.keyframe == keyframe)
-        _, first, second = np.intersect1d(self.point[before], self.point[own], return_indices=True)
-        return before[first], own[second]
-
-    def chosen(self, rows: NDArray[Any], least: int) -> tuple[Sightings, NDArray[np.int64]]:
-        """Those of points that keep so many, numbered anew, and the points that are kept."""
-        keyframe, point, image = self.keyframe[rows], self.point[rows], self.image[rows]
-        often = np.bincount(point)[point] >= least
-        points, numbers = np.unique(point[often], return_inverse=True)
-        return Sightings(keyframe[often], numbers, image[often]), points
+    return joined([window for window in windows if window is not None])
 
 
 @dataclass(frozen=True)
@@ -179,40 +137,7 @@ class Window(NamedTuple):
 
     lens: FloatArray
     sigma: float
-    sightings: int
     turn_deg: float
-    at_end: bool
-
-
-def follow(frames: Iterable[Frame]) -> tuple[Sightings, float]:
-    """Sightings of corners in the keyframes of some frames, and the size of a pixel in half widths."""
-    rows: list[FloatArray] = []
-    pixels, ids = np.zeros((0, 2), np.float32), np.zeros(0, np.int64)
-    last, last_ids, sought, width, before = pixels, ids, 0, 1, None
-    for frame in frames:
-        frame = _narrow(frame)
-        height, width = frame.grey.shape
-        if before is not None:
-            pixels, kept = track(before, frame.grey, pixels, _SEARCH)
-            inner = height - 2 * _BORDER_PX, width - 2 * _BORDER_PX
-            kept &= are_inside(pixels - _BORDER_PX, inner)
-            pixels, ids = pixels[kept], ids[kept]
-        before = frame.grey
-        _, own, at_last = np.intersect1d(ids, last_ids, return_indices=True)
-        moved = np.linalg.norm(pixels[own] - last[at_last], axis=1)
-        if len(own) > _LOST * len(last_ids) and median(moved) < _MOVED * width / 2:
-            continue
-        corners = new_corners(frame, pixels, _CORNERS - len(pixels), _TEXTURE)
-        pixels = np.concatenate([pixels, corners])
-        ids = np.concatenate([ids, sought + np.arange(len(corners))])
-        sought += len(corners)
-        last, last_ids = pixels, ids
-        image = (pixels - [(width - 1) / 2, (height - 1) / 2]) * (2.0 / width)
-        rows.append(np.column_stack([np.full(len(ids), len(rows)), ids, image]))
-    table = np.concatenate(rows) if rows else np.zeros((0, 4))
-    return Sightings(
-        table[:, 0].astype(np.int64), table[:, 1].astype(np.int64), table[:, 2:]
-    ), 2.0 / width
 
 
 def windows_that_turn(seen: Sightings) -> list[Sightings]:
@@ -225,9 +150,7 @@ def windows_that_turn(seen: Sightings) -> list[Sightings]:
         aside[k] = aside[k - 1] + (np.median(moved, axis=0) if len(moved) else 0.0)
     count = min(_KEYFRAMES, keyframes)
     starts = range(0, keyframes - count + 1, _KEYFRAMES // 2)
-    turns = [
-        float(np.ptp(aside[start : start + count], axis=0).max(initial=0.0)) for start in starts
-    ]
+    turns = [np.ptp(aside[start : start + count], axis=0).max() for start in starts if count]
     windows = []
     for n in np.argsort(turns)[::-1][:_WINDOWS].tolist():
         rows = np.flatnonzero((seen.keyframe >= starts[n]) & (seen.keyframe < starts[n] + count))
@@ -237,7 +160,7 @@ def windows_that_turn(seen: Sightings) -> list[Sightings]:
 
 
 def calibrated(seen: Sightings, pixel: float) -> Window | None:
-    """What a window says of its camera; ``pixel`` is its size in half widths. None where keyframes share too little."""
+    """What a window says of its camera; ``pixel`` is its size in half widths. None where it tells nothing."""
     started = _turning(seen, pixel)
     if started is None:
         return None
@@ -245,26 +168,25 @@ def calibrated(seen: Sightings, pixel: float) -> Window | None:
     start, _ = problem.solved(start, _BUT_FOCAL, 0.5 * pixel, _FEW)
     problem, start = problem.without_outliers(start, 8.0, pixel)
     for _ in range(2):
-        start, cost = problem.solved(start, _BUT_FOCAL, problem.spread(start, pixel), _FEW)
-    sigma = problem.spread(start, pixel)
-    start, at_end = problem.lowest(start, sigma)
+        sigma = problem.spread(start, pixel)
+        start, _ = problem.solved(start, _BUT_FOCAL, sigma, _FEW)
+    lowest = problem.lowest(start, sigma)
+    if lowest is None:
+        return None
+    start = lowest
     for _ in range(3):
         start, _ = problem.solved(start, _ALL, sigma, _MANY)
         problem, start = problem.without_outliers(start, 5.0, pixel)
         sigma = problem.spread(start, pixel)
     start, _ = problem.solved(start, _ALL, sigma, _MANY)
-    return Window(
-        start.lens,
-        problem.focal_sigma(start, sigma),
-        len(problem.seen),
-        float(np.rad2deg(np.linalg.norm(start.turns[:, :2], axis=1).max())),
-        at_end,
-    )
+    if len(problem.seen) < _LEAST_SIGHTINGS:
+        return None
+    turn = np.linalg.norm(start.turns[:, :2], axis=1).max()
+    return Window(start.lens, problem.focal_sigma(start, sigma), float(np.rad2deg(turn)))
 
 
-def joined(windows: Iterable[Window]) -> FoundCamera:
+def joined(telling: Sequence[Window]) -> FoundCamera:
     """The camera by windows, robustly, and a prior of its focal length; the prior's alone where they say too little."""
-    telling = [w for w in windows if w.sightings > _LEAST_SIGHTINGS and not w.at_end]
     values = np.array([*(window.lens[0] for window in telling), _PRIOR[0]])
     own_sigmas = [np.hypot(_INFLATED * window.sigma, _FLOOR) for window in telling]
     sigmas = np.array([*own_sigmas, UNKNOWN_FX_SIGMA])
@@ -312,8 +234,8 @@ class Problem:
         seen, points = self.seen.chosen(good, least=2)
         return Problem(seen, self._cameras), replace(given, points=given.points[points])
 
-    def lowest(self, start: Reconstruction, sigma: float) -> tuple[Reconstruction, bool]:
-        """The least cost along a profile over the focal length, between its steps, and whether it is an end of it."""
+    def lowest(self, start: Reconstruction, sigma: float) -> Reconstruction | None:
+        """The least cost along a profile over the focal length, between its steps; None where it is an end of it."""
         ends = -np.log(np.tan(np.deg2rad([_WIDEST_DEG, _NARROWEST_DEG]) / 2))
         profile = [(float(start.lens[0]), self._cost(start, sigma), start)]
         for ratio in (_RATIO, 1.0 / _RATIO):
@@ -326,12 +248,11 @@ class Problem:
         profile.sort(key=lambda step: step[0])
         costs = np.array([cost for _, cost, _ in profile])
         least = int(np.argmin(costs))
-        best = profile[least][2]
         if least in (0, len(profile) - 1):
-            return best, True
+            return None
         low, middle, high = costs[least - 1 : least + 2]
         between = 0.5 * (low - high) / max(low - 2.0 * middle + high, 1e-12)
-        return best.stretched(_RATIO ** float(np.clip(between, -1, 1))), False
+        return profile[least][2].stretched(_RATIO ** float(np.clip(between, -1, 1)))
 
     def solved(
         self, start: Reconstruction, first: int, sigma: float, iterations: int
@@ -340,18 +261,18 @@ class Problem:
         cost, damping = self._cost(start, sigma), _FIRST_DAMPING
         for _ in range(iterations):
             system = self._system(start, first, sigma)
-            gain, moved = 0.0, 0.0
-            for _ in range(6):
+            for _ in range(_TRIALS):
                 tried = self._stepped(start, system, first, damping)
-                if tried is not None:
-                    moved = abs(float(tried.lens[0] - start.lens[0]))
-                    cost_tried = self._cost(tried, sigma)
-                    if moved < _FARTHEST_STEP and cost_tried < cost:
-                        gain, start, cost = (cost - cost_tried) / cost, tried, cost_tried
-                        damping = max(0.1 * damping, _LEAST_DAMPING)
-                        break
+                cost_tried = self._cost(tried, sigma)
+                moved = abs(float(tried.lens[0] - start.lens[0]))
+                if moved < _FARTHEST_STEP and cost_tried < cost:
+                    break
                 damping = max(8.0 * damping, 1e-6)
-            if gain < 1e-5 and (gain == 0 or moved < _SETTLED):
+            else:
+                break
+            gain, start, cost = (cost - cost_tried) / cost, tried, cost_tried
+            damping = max(0.1 * damping, _LEAST_DAMPING)
+            if gain < _LEAST_GAIN and moved < _SETTLED:
                 break
         return start, cost
 
@@ -384,70 +305,58 @@ class Problem:
         weights = before / (1.0 + self._squares(given, sigma) / _CAUCHY) / sigma**2
         error = np.where(before[:, None], image - seen.image, 0.0)
         motion = pixel_jacobian(X, np.full(2, np.exp(given.lens[0]))).transpose(2, 1, 0)
-        by_point_camera = by_ideal @ motion[:, :, 3:]
-        homogeneous = given.points[seen.point, 3]
-        by_camera = np.concatenate(
-            [by_ideal @ motion[:, :, :3], by_point_camera * homogeneous[:, None, None]], axis=2
-        )
-        basis = _tangents(given.points)
-        by_homogeneous = by_point_camera @ given.T_camera_world[seen.keyframe, :3]
-        by_point = by_homogeneous @ basis[seen.point]
-        by_lens = by_lens[:, :, first:]
-        weighed = [each * weights[:, None, None] for each in (by_camera, by_point, by_lens)]
-        A, B, C = (each.transpose(0, 2, 1) for each in weighed)
-        own, side = np.zeros((n + by_lens.shape[2],) * 2), np.zeros(n + by_lens.shape[2])
-        W = np.zeros((len(given.points), 3, len(side)))
-        np.add.at(W[:, :, n:], seen.point, B @ by_lens)
-        for k in range(1, self._cameras):
-            rows, at = np.flatnonzero(seen.keyframe == k), slice(6 * (k - 1), 6 * k)
-            own[at, at] = np.tensordot(A[rows], by_camera[rows], ([0, 2], [0, 1]))
-            own[at, n:] = np.tensordot(A[rows], by_lens[rows], ([0, 2], [0, 1]))
-            own[n:, at] = own[at, n:].T
-            side[at] = np.tensordot(A[rows], error[rows], ([0, 2], [0, 1]))
-            W[seen.point[rows], :, at] = B[rows] @ by_camera[rows]
-        own[n:, n:] = np.tensordot(C, by_lens, ([0, 2], [0, 1])) + np.diag(
-            _PRIOR_SIGMAS[first:] ** -2
-        )
-        from_prior = (given.lens - _PRIOR)[first:] / _PRIOR_SIGMAS[first:] ** 2
-        side[n:] = np.tensordot(C, error, ([0, 2], [0, 1])) + from_prior
-        V, point_side = np.zeros((len(W), 3, 3)), np.zeros((len(W), 3))
-        np.add.at(V, seen.point, B @ by_point)
-        np.add.at(point_side, seen.point, (B @ error[:, :, None])[:, :, 0])
-        return _System(own, side, V, point_side, W, basis)
+        by_point = motion[:, :, 3:] @ given.T_camera_world[seen.keyframe, :3]
+        motion[:, :, 3:] *= given.points[seen.point, 3][:, None, None]
+        by_pose = by_ideal @ np.concatenate([by_point, motion], axis=2)
+        # of the point (four), the camera (six), the lens, and the error
+        J = np.concatenate([by_pose, by_lens[:, :, first:], error[:, :, None]], axis=2)
+        normal = (J * weights[:, None, None]).transpose(0, 2, 1) @ J
+        of_points = _sums(normal[:, :4], seen.point, len(given.points))
+        of_cameras = _sums(normal[:, 4:], seen.keyframe, self._cameras)
+        lens, prior = of_cameras[:, 6:-1].sum(axis=0), np.diag(_PRIOR_SIGMAS[first:] ** -2)
+        own = block_diag(*of_cameras[1:, :6, 4:10], lens[:, 10:-1] + prior)
+        own[:n, n:] = of_cameras[1:, :6, 10:-1].reshape(n, -1)
+        own[n:, :n] = own[:n, n:].T
+        from_prior = prior @ (given.lens - _PRIOR)[first:]
+        side = np.append(of_cameras[1:, :6, -1], lens[:, -1] + from_prior)
+        W = np.zeros((len(given.points), 4, self._cameras, 6))
+        W[seen.point, :, seen.keyframe] = normal[:, :4, 4:10]
+        W = np.dstack([W[:, :, 1:].reshape(len(W), 4, n), of_points[:, :, 10:-1]])
+        V, length = of_points[:, :, :4], given.points[:, :, None] * given.points[:, None]
+        V += length * np.trace(V, axis1=1, axis2=2)[:, None, None]  # which no image shows
+        return _System(own, side, V, of_points[:, :, -1], W)
 
     def _stepped(
         self, start: Reconstruction, system: _System, first: int, damping: float
-    ) -> Reconstruction | None:
+    ) -> Reconstruction:
         reduced, side, inverse = _reduced(system, damping)
         try:
             step = cho_solve(cho_factor(reduced), -side)
-        except (LinAlgError, ValueError):
-            return None
+        except LinAlgError:
+            return start
         by_point = -np.einsum("pij,pj->pi", inverse, system.point_side + system.W @ step)
         n = 6 * (self._cameras - 1)
         moves = step[:n].reshape(-1, 6)
         T, lens = start.T_camera_world.copy(), start.lens.copy()
         T[1:] = compose(from_rotation_vector(moves[:, :3], moves[:, 3:]), T[1:])
         lens[first:] += step[n:]
-        points = start.points + np.einsum("pij,pj->pi", system.basis, by_point)
-        return Reconstruction(T, _normalised(points), lens)
+        return Reconstruction(T, _normalised(start.points + by_point), lens)
 
 
 class _System(NamedTuple):
-    """Blocks and right sides: ``own`` of cameras and lens, ``V`` of points; ``W`` ``(P, 3, n)`` between them."""
+    """Blocks and right sides: ``own`` of cameras and lens, ``V`` of points; ``W`` ``(P, 4, n)`` between them."""
 
     own: FloatArray
     side: FloatArray
     V: FloatArray
     point_side: FloatArray
     W: FloatArray
-    basis: FloatArray
 
 
 def _reduced(system: _System, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The system without the points, its right side, and the inverse of the points' blocks."""
     diagonal = np.einsum("pii->pi", system.V) * damping + 1e-12
-    inverse = np.linalg.inv(system.V + diagonal[:, :, None] * np.eye(3))
+    inverse = np.linalg.inv(system.V + diagonal[:, :, None] * np.eye(4))
     W = system.W.reshape(-1, system.W.shape[2])
     with_points = np.matmul(inverse, system.W).reshape(W.shape)
     own = system.own + np.diag(damping * np.diag(system.own) + 1e-9)
@@ -469,13 +378,11 @@ def _turning(seen: Sightings, pixel: float) -> tuple[Problem, Reconstruction] | 
     R_camera_world, rows = np.array(R), seen.keyframe < len(R)
     part, points = seen.chosen(rows, least=2)
     rays = _normalised(rays[rows & np.isin(seen.point, points)])
-    directions = np.zeros((len(points), 4))
     in_world = np.einsum("sji,sj->si", R_camera_world[part.keyframe], rays)
-    np.add.at(directions[:, :3], part.point, in_world)
-    directions = _normalised(directions)
-    directions[:, 3] = _NEARNESS
+    directions = _normalised(_sums(in_world, part.point, len(points)))
+    far = _normalised(np.column_stack([directions, np.full(len(points), _NEARNESS)]))
     places = _APART * np.random.default_rng(0).normal(size=(len(R), 3))
-    start = Reconstruction(make(R_camera_world, places), _normalised(directions), _PRIOR)
+    start = Reconstruction(make(R_camera_world, places), far, _PRIOR)
     problem = Problem(part, len(R))
     for sigma in _FIRST_SIGMAS_PX:
         start, _ = problem.solved(start, _NOTHING, sigma * pixel, _MANY)
@@ -496,23 +403,11 @@ def _bent(ideal: FloatArray, lens: FloatArray) -> tuple[FloatArray, FloatArray, 
     return ideal * factor + lens[3:], by_ideal, np.concatenate([radial, by_centre], axis=2)
 
 
-def _tangents(points: FloatArray) -> FloatArray:
-    """Three directions ``(P, 4, 3)`` across each homogeneous point: columns of Householder's reflection."""
-    across = points.copy()
-    across[:, 3] += np.where(points[:, 3] >= 0, 1.0, -1.0)
-    square = (across**2).sum(axis=1)[:, None, None]
-    return np.asarray((np.eye(4) - 2.0 * across[:, :, None] * across[:, None] / square)[:, :, :3])
+def _sums(values: FloatArray, groups: NDArray[np.int64], count: int) -> FloatArray:
+    """Sums ``(count, ...)`` of the values ``(S, ...)`` of each group ``(S,)``."""
+    own = csr_array((np.ones(len(groups)), (groups, np.arange(len(groups)))), (count, len(groups)))
+    return np.asarray((own @ values.reshape(len(values), -1)).reshape(count, *values.shape[1:]))
 
 
 def _normalised(vectors: FloatArray) -> FloatArray:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-
-def _narrow(frame: Frame) -> Frame:
-    """The same image, at most so wide that following its corners is quick."""
-    height, width = frame.image.shape[:2]
-    if width <= _WIDTH_PX:
-        return frame
-    size = _WIDTH_PX, round(height * _WIDTH_PX / width)
-    small = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
-    return Frame(frame.index, frame.stamp, np.asarray(small, np.uint8), frame.fixed)

@@ -1,10 +1,11 @@
 """The camera of a recording that nobody calibrated: focal length, lens and principal point, where it turns.
 
 Corners of the first images are followed from keyframe to keyframe. Each window of keyframes is reconstructed at one
-guessed focal length, from keyframes that turn on the spot, and then at others along the direction that driving straight on cannot see: lengths along the
-axis grow as the focal length, turns shrink. From the lowest cost of this profile a bundle adjustment frees the focal
-length, two radial coefficients and the principal point. From one guess it would not converge. Windows are joined
-robustly, with sigmas as measured on recordings with a calibration (``docs/own-camera.md``).
+guessed focal length, beginning with keyframes that turn on the spot, and then at others, along the direction that
+driving straight on cannot see: lengths along the axis grow as the focal length, turns shrink. From the lowest cost of
+this profile a bundle adjustment frees the focal length, two radial coefficients and the principal point. From one guess
+it would not converge. Windows are joined robustly, with sigmas as measured on recordings with a calibration
+(``docs/own-camera.md``).
 
 Images are measured in half their width from their middle, so that nothing here knows their size; the lens then does
 not move with the focal length.
@@ -12,6 +13,7 @@ not move with the focal length.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -26,7 +28,7 @@ from erfsfm.common.processes import limit_library_threads
 from erfsfm.common.readers.camera_file import UNKNOWN_FOV_DEG, UNKNOWN_FX_SIGMA, CameraFile
 from slam.frames import Frame
 from slam.frontend.tracking import Sightings, follow
-from slam.geometry.multiview import pixel_jacobian, rotation_between
+from slam.geometry.multiview import LEAST_DEPTH, pixel_jacobian, rotation_between
 from slam.geometry.robust import mad_sigma, weighted_median
 from slam.geometry.se3 import FloatArray, compose, from_rotation_vector, invert, make
 
@@ -39,8 +41,8 @@ _PRIOR = np.array([-np.log(np.tan(np.deg2rad(UNKNOWN_FOV_DEG) / 2)), 0.0, 0.0, 0
 _PRIOR_SIGMAS = np.array([0.5, 0.15, 0.05, 0.024, 0.024])
 _ALL, _BUT_FOCAL, _NOTHING = 0, 1, 5  # the first of these that is free
 _FEW, _MANY = 5, 25  # iterations
-# where all keyframes turn on the spot: sigmas of sightings, one after the other, how far keyframes lie apart, and 1 over
-# the distance of the points
+# where all keyframes turn on the spot: sigmas of sightings, one after the other, how far keyframes lie apart, and 1
+# over the distance of the points
 _FIRST_SIGMAS_PX, _APART, _NEARNESS = (2.0, 0.7), 1e-3, 0.1
 _LEAST_SHARED = 15  # corners of a keyframe and the one before
 _WIDEST_DEG, _NARROWEST_DEG = 125.0, 32.0  # ends of a profile
@@ -48,10 +50,10 @@ _RATIO, _MOST_RISE = 1.15, 30.0  # of its steps, and of its cost above the least
 _CAUCHY = 4.0  # squared sigmas
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-4, 1e-11
 _TRIALS, _LEAST_GAIN = 6, 1e-5  # of a step, and of the cost
-_FARTHEST_STEP, _SETTLED = 0.4, 0.002  # of the logarithm of the focal length
 _TURNING = 0.5  # radians beyond which turns are told without the focal length
 # the formal sigma of a window is several times too small, and rectified images keep an error of their lens
 _INFLATED, _FLOOR, _SYSTEMATIC = 3.0, 0.03, 0.02
+_BY_TURN = 0.3  # sigma of a window that turns by one degree; less, as it turns more
 _HUBER = 1.5
 
 
@@ -74,11 +76,17 @@ class FoundCamera:
         """The camera file in place of a ``guess``, whose size, rate and height hold."""
         half = guess.width / 2
         focal, cx, cy = (round(half * value, 2) for value in (self.focal, *self.centre))
-        keys = {"fx": focal, "fy": focal, "cx": guess.cx + cx, "cy": guess.cy + cy}
-        distortion = *(round(value, 5) for value in self.radial), 0.0, 0.0
-        lens = {"model": "opencv", "distortion": distortion}
-        told = {"fx_sigma": round(self.sigma, 4), "source": source}
-        return guess.model_copy(update=keys | lens | told)
+        keys = {
+            "fx": focal,
+            "fy": focal,
+            "cx": guess.cx + cx,
+            "cy": guess.cy + cy,
+            "model": "opencv",
+            "distortion": (*(round(value, 5) for value in self.radial), 0.0, 0.0),
+            "fx_sigma": round(self.sigma, 4),
+            "source": source,
+        }
+        return guess.model_copy(update=keys)
 
     def sentence(self, width: int) -> str:
         """What the user is told of it, for images of this width in pixels."""
@@ -105,7 +113,7 @@ def find_camera(frames: Iterable[Frame]) -> FoundCamera:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """``T_camera_world`` ``(K, 4, 4)``, the first the identity; homogeneous ``points`` ``(P, 4)``; ``lens`` ``(5,)``."""
+    """``T_camera_world`` ``(K, 4, 4)``, first the identity; homogeneous ``points`` ``(P, 4)``; ``lens`` ``(5,)``."""
 
     T_camera_world: FloatArray
     points: FloatArray
@@ -161,8 +169,7 @@ def windows_that_turn(seen: Sightings) -> list[Sightings]:
 
 def calibrated(seen: Sightings, pixel: float) -> Window | None:
     """What a window says of its camera; ``pixel`` is its size in half widths. None where it tells nothing."""
-    started = _turning(seen, pixel)
-    if started is None:
+    if (started := _turning(seen, pixel)) is None:
         return None
     problem, start = started
     start, _ = problem.solved(start, _BUT_FOCAL, 0.5 * pixel, _FEW)
@@ -170,8 +177,7 @@ def calibrated(seen: Sightings, pixel: float) -> Window | None:
     for _ in range(2):
         sigma = problem.spread(start, pixel)
         start, _ = problem.solved(start, _BUT_FOCAL, sigma, _FEW)
-    lowest = problem.lowest(start, sigma)
-    if lowest is None:
+    if (lowest := problem.lowest(start, sigma)) is None:
         return None
     start = lowest
     for _ in range(3):
@@ -181,15 +187,15 @@ def calibrated(seen: Sightings, pixel: float) -> Window | None:
     start, _ = problem.solved(start, _ALL, sigma, _MANY)
     if len(problem.seen) < _LEAST_SIGHTINGS:
         return None
-    turn = np.linalg.norm(start.turns[:, :2], axis=1).max()
+    turn = np.linalg.norm(start.turns[:, :2], axis=1).max() + 1e-9
     return Window(start.lens, problem.focal_sigma(start, sigma), float(np.rad2deg(turn)))
 
 
 def joined(telling: Sequence[Window]) -> FoundCamera:
     """The camera by windows, robustly, and a prior of its focal length; the prior's alone where they say too little."""
     values = np.array([*(window.lens[0] for window in telling), _PRIOR[0]])
-    own_sigmas = [np.hypot(_INFLATED * window.sigma, _FLOOR) for window in telling]
-    sigmas = np.array([*own_sigmas, UNKNOWN_FX_SIGMA])
+    doubts = [math.hypot(_INFLATED * w.sigma, _FLOOR, _BY_TURN / w.turn_deg) for w in telling]
+    sigmas = np.array([*doubts, UNKNOWN_FX_SIGMA])
     centre = weighted_median(values, sigmas**-2)
     for _ in range(10):
         near = np.maximum(np.abs(values - centre) / sigmas, 1e-9)
@@ -197,7 +203,7 @@ def joined(telling: Sequence[Window]) -> FoundCamera:
         centre = float(weights @ values / weights.sum())
     disagree = float(weights @ (values - centre) ** 2) / max(len(telling), 1)
     sigma = float(np.hypot(np.sqrt(max(1.0, disagree) / weights.sum()), _SYSTEMATIC))
-    if not telling or sigma > ROUGH:
+    if sigma > ROUGH:
         focal = float(np.exp(_PRIOR[0]))
         return FoundCamera(focal, (0.0, 0.0), (0.0, 0.0), UNKNOWN_FX_SIGMA, 0, 0.0)
     focal, own = float(np.exp(centre)), weights[:-1]
@@ -214,16 +220,15 @@ class Problem:
         self.seen, self._cameras = seen, cameras
 
     def errors(self, given: Reconstruction) -> FloatArray:
-        """Of the image of each sighting ``(S, 2)``; infinite behind the camera."""
-        ideal, _, before = self._ideal(given)
-        error = _bent(ideal, given.lens)[0] - self.seen.image
-        return np.where(before[:, None], error, np.inf)
+        """Of the image of each sighting ``(S, 2)``; huge behind the camera."""
+        return _bent(self._ideal(given)[0], given.lens)[0] - self.seen.image
 
     def spread(self, given: Reconstruction, pixel: float) -> float:
         """Sigma of a coordinate of a sighting."""
         count = 2 * len(self.seen)
         freedom = count - 6 * (self._cameras - 1) - 3 * len(given.points)
-        return max(mad_sigma(self.errors(given)) * np.sqrt(count / max(freedom, 1)), 0.08 * pixel)
+        sigma = mad_sigma(self.errors(given)) * math.sqrt(count / max(freedom, 1))
+        return max(sigma, 0.08 * pixel)
 
     def without_outliers(
         self, given: Reconstruction, sigmas: float, pixel: float
@@ -235,7 +240,7 @@ class Problem:
         return Problem(seen, self._cameras), replace(given, points=given.points[points])
 
     def lowest(self, start: Reconstruction, sigma: float) -> Reconstruction | None:
-        """The least cost along a profile over the focal length, between its steps; None where it is an end of it."""
+        """The least cost along a profile over the focal length; None where it is an end of it."""
         ends = -np.log(np.tan(np.deg2rad([_WIDEST_DEG, _NARROWEST_DEG]) / 2))
         profile = [(float(start.lens[0]), self._cost(start, sigma), start)]
         for ratio in (_RATIO, 1.0 / _RATIO):
@@ -250,9 +255,7 @@ class Problem:
         least = int(np.argmin(costs))
         if least in (0, len(profile) - 1):
             return None
-        low, middle, high = costs[least - 1 : least + 2]
-        between = 0.5 * (low - high) / max(low - 2.0 * middle + high, 1e-12)
-        return profile[least][2].stretched(_RATIO ** float(np.clip(between, -1, 1)))
+        return profile[least][2]
 
     def solved(
         self, start: Reconstruction, first: int, sigma: float, iterations: int
@@ -264,15 +267,14 @@ class Problem:
             for _ in range(_TRIALS):
                 tried = self._stepped(start, system, first, damping)
                 cost_tried = self._cost(tried, sigma)
-                moved = abs(float(tried.lens[0] - start.lens[0]))
-                if moved < _FARTHEST_STEP and cost_tried < cost:
+                if cost_tried < cost:
                     break
                 damping = max(8.0 * damping, 1e-6)
             else:
                 break
             gain, start, cost = (cost - cost_tried) / cost, tried, cost_tried
             damping = max(0.1 * damping, _LEAST_DAMPING)
-            if gain < _LEAST_GAIN and moved < _SETTLED:
+            if gain < _LEAST_GAIN:
                 break
         return start, cost
 
@@ -280,18 +282,16 @@ class Problem:
         """Formal sigma of the logarithm of the focal length."""
         reduced, _, _ = _reduced(self._system(given, _ALL, sigma), 1e-10)
         covariance = np.linalg.pinv(reduced, hermitian=True, rcond=1e-13)
-        return float(np.sqrt(max(covariance[-5, -5], 0.0)))
+        return float(np.sqrt(covariance[-5, -5]))
 
-    def _ideal(self, given: Reconstruction) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-        """Images ``(S, 2)`` without lens, points in their cameras ``(S, 3)``, and whether before them ``(S,)``."""
+    def _ideal(self, given: Reconstruction) -> tuple[FloatArray, FloatArray]:
+        """Images without lens ``(S, 2)``, and points in their cameras ``(S, 3)``."""
         T, points = given.T_camera_world[self.seen.keyframe], given.points[self.seen.point]
         X = np.einsum("sij,sj->si", T[:, :3], points)
-        z = np.maximum(X[:, 2:], 1e-9)
-        return np.exp(given.lens[0]) * X[:, :2] / z, X, X[:, 2] > 1e-9
+        return np.exp(given.lens[0]) * X[:, :2] / np.maximum(X[:, 2:], LEAST_DEPTH), X
 
     def _squares(self, given: Reconstruction, sigma: float) -> FloatArray:
-        squares = (self.errors(given) ** 2).sum(axis=1) / sigma**2
-        return np.where(np.isfinite(squares), squares, 1e6)
+        return np.asarray((self.errors(given) ** 2).sum(axis=1) / sigma**2)
 
     def _cost(self, given: Reconstruction, sigma: float) -> float:
         robust = _CAUCHY * np.log1p(self._squares(given, sigma) / _CAUCHY)
@@ -300,16 +300,17 @@ class Problem:
     def _system(self, given: Reconstruction, first: int, sigma: float) -> _System:
         """Normal equations of cameras but the first and the lens, of points, and between them."""
         seen, n = self.seen, 6 * (self._cameras - 1)
-        ideal, X, before = self._ideal(given)
+        ideal, X = self._ideal(given)
         image, by_ideal, by_lens = _bent(ideal, given.lens)
-        weights = before / (1.0 + self._squares(given, sigma) / _CAUCHY) / sigma**2
-        error = np.where(before[:, None], image - seen.image, 0.0)
+        weights = 1.0 / (1.0 + self._squares(given, sigma) / _CAUCHY) / sigma**2
         motion = pixel_jacobian(X, np.full(2, np.exp(given.lens[0]))).transpose(2, 1, 0)
         by_point = motion[:, :, 3:] @ given.T_camera_world[seen.keyframe, :3]
         motion[:, :, 3:] *= given.points[seen.point, 3][:, None, None]
         by_pose = by_ideal @ np.concatenate([by_point, motion], axis=2)
         # of the point (four), the camera (six), the lens, and the error
-        J = np.concatenate([by_pose, by_lens[:, :, first:], error[:, :, None]], axis=2)
+        J = np.concatenate(
+            [by_pose, by_lens[:, :, first:], (image - seen.image)[:, :, None]], axis=2
+        )
         normal = (J * weights[:, None, None]).transpose(0, 2, 1) @ J
         of_points = _sums(normal[:, :4], seen.point, len(given.points))
         of_cameras = _sums(normal[:, 4:], seen.keyframe, self._cameras)
@@ -329,10 +330,10 @@ class Problem:
     def _stepped(
         self, start: Reconstruction, system: _System, first: int, damping: float
     ) -> Reconstruction:
-        reduced, side, inverse = _reduced(system, damping)
         try:
+            reduced, side, inverse = _reduced(system, damping)
             step = cho_solve(cho_factor(reduced), -side)
-        except LinAlgError:
+        except (LinAlgError, ValueError):
             return start
         by_point = -np.einsum("pij,pj->pi", inverse, system.point_side + system.W @ step)
         n = 6 * (self._cameras - 1)
@@ -365,7 +366,7 @@ def _reduced(system: _System, damping: float) -> tuple[FloatArray, FloatArray, F
 
 
 def _turning(seen: Sightings, pixel: float) -> tuple[Problem, Reconstruction] | None:
-    """A start by the usual lens: the keyframes turn on the spot, as far as they share corners, and points are far away."""
+    """A start by the usual lens: keyframes turn on the spot, as far as they share corners, and points are far."""
     rays = np.column_stack([seen.image * np.exp(-_PRIOR[0]), np.ones(len(seen))])
     R = [np.eye(3)]
     for k in range(1, int(seen.keyframe.max(initial=-1)) + 1):
@@ -410,4 +411,4 @@ def _sums(values: FloatArray, groups: NDArray[np.int64], count: int) -> FloatArr
 
 
 def _normalised(vectors: FloatArray) -> FloatArray:
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

@@ -40,6 +40,9 @@ _ACROSS_PX = 1.0  # largest error of a corner over several steps, by the way acr
 ROTATION_BASELINE = 2
 # tracks below which they are sought again, with the wide window and equal exposure
 FEW_CORNERS = 60
+_FOLLOWED, _FOLLOWED_WIDTH_PX, _BORDER_PX = 500, 960, 8.0
+_KEYFRAME_MOVED = 0.06  # of half the width, from keyframe to keyframe
+_KEYFRAME_LOST = 0.5  # of the corners of the last keyframe
 _WIDE_WINDOW_PX = 31  # side of the window after most tracks were lost, pixels
 
 
@@ -86,9 +89,6 @@ CALIBRATION_SEARCH = Search(
     side=16, levels=4, limits=(20, 0.02), back=None, error_px=0.5, norm=np.inf, texture=1e-4
 )
 CALIBRATION_CORNERS = Texture(quality=0.01, spacing_px=10.0, block_px=5)
-_FOLLOWED, _FOLLOWED_WIDTH_PX, _BORDER_PX = 500, 960, 8.0
-_KEYFRAME_MOVED = 0.06  # of half the width, from keyframe to keyframe
-_KEYFRAME_LOST = 0.5  # of the corners of the last keyframe
 
 
 def track(
@@ -124,7 +124,7 @@ def _lucas_kanade(
     side: int,
     levels: int,
     limits: tuple[int, float],
-    texture: float,
+    texture: float = _LEAST_TEXTURE,
 ) -> tuple[Pixels, NDArray[np.bool_]]:
     if not len(pixels):
         return pixels, np.zeros(0, np.bool_)
@@ -498,7 +498,8 @@ def follow(frames: Iterable[Frame]) -> tuple[Sightings, float]:
         image = (pixels - [(width - 1) / 2, (height - 1) / 2]) * (2.0 / width)
         rows.append(np.column_stack([np.full(len(ids), len(rows)), ids, image]))
     table = np.concatenate(rows) if rows else np.zeros((0, 4))
-    return Sightings(*table[:, :2].T.astype(np.int64), table[:, 2:]), 2.0 / width
+    keyframes, points = table[:, :2].T.astype(np.int64)
+    return Sightings(keyframes, points, table[:, 2:]), 2.0 / width
 
 
 def _narrow(frame: Frame) -> Frame:

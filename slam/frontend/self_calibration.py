@@ -127,17 +127,14 @@ class Reconstruction:
     def stretched(self, ratio: float) -> Reconstruction:
         """The same images under a focal length so many times as long, to first order in the turns."""
         points = _normalised(self.points * [1.0, 1.0, ratio, 1.0])
-        T_world_camera = invert(self.T_camera_world)
-        turns = self.turns.copy()
+        centres = invert(self.T_camera_world)[:, :3, 3] * [1.0, 1.0, ratio]
+        turns = self.turns
         aside = np.maximum(np.linalg.norm(turns[:, :2], axis=1), 1e-9)
         shrunk = np.where(aside < _TURNING, np.arctan(np.tan(aside) / ratio) / aside, 1.0)
         turns[:, :2] *= shrunk[:, None]
         R = Rotation.from_rotvec(turns).as_matrix()
-        centres = T_world_camera[:, :3, 3] * [1.0, 1.0, ratio]
-        T_camera_world = make(R, -np.einsum("kij,kj->ki", R, centres))
-        return Reconstruction(
-            T_camera_world, points, self.lens + np.log(ratio) * (np.arange(5) == 0)
-        )
+        lens = self.lens + math.log(ratio) * np.eye(5)[0]
+        return Reconstruction(make(R, -np.einsum("kij,kj->ki", R, centres)), points, lens)
 
 
 class Window(NamedTuple):
@@ -201,12 +198,12 @@ def joined(telling: Sequence[Window]) -> FoundCamera:
         near = np.maximum(np.abs(values - centre) / sigmas, 1e-9)
         weights = np.minimum(1.0, _HUBER / near) / sigmas**2
         centre = float(weights @ values / weights.sum())
-    disagree = float(weights @ (values - centre) ** 2) / max(len(telling), 1)
+    disagree = float(weights @ (values - centre) ** 2) / len(values)
     sigma = float(np.hypot(np.sqrt(max(1.0, disagree) / weights.sum()), _SYSTEMATIC))
     if sigma > ROUGH:
-        focal = float(np.exp(_PRIOR[0]))
+        focal = math.exp(_PRIOR[0])
         return FoundCamera(focal, (0.0, 0.0), (0.0, 0.0), UNKNOWN_FX_SIGMA, 0, 0.0)
-    focal, own = float(np.exp(centre)), weights[:-1]
+    focal, own = math.exp(centre), weights[:-1]
     first, second, x, y = (own @ np.array([w.lens[1:] for w in telling]) / own.sum()).tolist()
     turn_deg = max(window.turn_deg for window in telling)
     radial = first * focal**2, second * focal**4
@@ -227,8 +224,8 @@ class Problem:
         """Sigma of a coordinate of a sighting."""
         count = 2 * len(self.seen)
         freedom = count - 6 * (self._cameras - 1) - 3 * len(given.points)
-        sigma = mad_sigma(self.errors(given)) * math.sqrt(count / max(freedom, 1))
-        return max(sigma, 0.08 * pixel)
+        inflated = math.sqrt(count / max(freedom, 1))
+        return max(mad_sigma(self.errors(given)) * inflated, 0.08 * pixel)
 
     def without_outliers(
         self, given: Reconstruction, sigmas: float, pixel: float

@@ -29,7 +29,8 @@ Sequence = Annotated[
     ),
 ]
 Camera = Annotated[
-    Path | None, typer.Option(help="camera.yaml, or fov=70: the horizontal field of view, degrees")
+    Path | None,
+    typer.Option(help="camera.yaml, or fov=70,height=1.4,fps=30 (degrees, metres), or auto (run)"),
 ]
 Frames = Annotated[str | None, typer.Option(help="A:B, half-open")]
 Weights = Annotated[str, typer.Option(help="default, sim, erf-dfc, erf-dfcv2 or a training output")]

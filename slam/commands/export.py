@@ -294,8 +294,8 @@ def _recording(
     place, camera = (
         Path(recorded[name]) if name in recorded else None for name in ("dataset", "camera")
     )
-    if (camera_found := folder.path / CAMERA_FILE).is_file():
-        camera = camera_found
+    if (own_camera := folder.path / CAMERA_FILE).is_file():
+        camera = own_camera
     elif dataset is not None and camera is not None and not camera.exists():
         camera = None  # it may have moved with the images
     try:

@@ -355,17 +355,12 @@ def open_recording(request: RunRequest) -> RecordedSequence:
     Raises:
         SequenceError: as `open_sequence`.
     """
-    asked = request.camera
-
-    def opened(camera: Path | None) -> RecordedSequence:
-        given = request.dataset, request.sequence, camera, request.frames, request.truth
-        return open_sequence(*given)
-
+    asked, place = request.camera, (request.dataset, request.sequence)
     try:
-        recording = opened(asked)
+        recording = open_sequence(*place, asked, request.frames, request.truth)
     except MissingCameraError:
         asked = AUTO
-        recording = opened(asked)
+        recording = open_sequence(*place, asked, request.frames, request.truth)
     camera = recording.camera
     if asked is None or not is_auto(asked) or not isinstance(camera, CameraFile):
         return recording
@@ -373,11 +368,10 @@ def open_recording(request: RunRequest) -> RecordedSequence:
 
     def frames() -> Iterator[Frame]:
         for index in range(total):
-            request.progress("camera", index, total)
+            request.progress("camera", index + 1, total)
             frame = read_frame(recording, index)
             if isinstance(frame, Frame):
                 yield frame
-        request.progress("camera", total, total)
 
     found = find_camera(frames())
     said = found.sentence(camera.width)

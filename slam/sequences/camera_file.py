@@ -194,8 +194,7 @@ def require_stated(given: Path | None) -> None:
 
 def _is_line(given: Path) -> bool:
     """Whether the user wrote a camera on one line, not the name of a file."""
-    first, *_ = str(given).split(",")
-    return first == str(AUTO) or first.partition("=")[0] in ("fov", "height", "fps")
+    return _WORD.fullmatch(str(given).split(",")[0]) is not None
 
 
 def _read_foreign(path: Path, fps: float) -> CameraFile | None:

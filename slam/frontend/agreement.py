@@ -262,8 +262,7 @@ def of_focal_length(found: FocalLength, camera: Intrinsics) -> Agreement | None:
         figure += f"{', ' if figure else ''}measured from corners it is {100 * np.exp(logarithm):.0f} % of the given"
         figure += f", give or take {100 * sigma:.0f} %"
         if sigmas > DOUBTFUL:
-            fov = 2.0 * np.arctan(camera.width / (2.0 * camera.fx * np.exp(logarithm)))
-            figure += f": try fov={np.rad2deg(fov):.0f}"
+            figure += ": --camera auto measures it where the camera turns"
     if is_guess:
         return Agreement("the guessed focal length", max(sigmas, _CAPPED), figure, "good drives")
     return Agreement("the focal length", sigmas, figure) if figure else None

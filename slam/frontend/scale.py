@@ -47,6 +47,7 @@ _SMOOTHING_FRAMES = 41  # window over which the scale of a frame is averaged, fr
 _ITERATIONS = 20
 _HUBER_ITERATIONS = 5
 _HUBER_K = 1.345
+_IDLE = 1e-6  # information on a length that nothing measures
 _MOST_CORRELATED = 0.999
 # sigmas of logarithms: of a length by learned depth, measured on drives with truth, and least of
 # the ratio of two steps
@@ -57,11 +58,13 @@ _RATIO_WIDENING = 1.5  # factor on the sigma of a ratio measured by triangulated
 # neighbours share
 _BESIDE_ROAD = 4.0
 _UNIT_WALK_SIGMA = 0.003  # sigma per step of the random walk of learned depth's scale
+_FIRST_WALK = 100.0  # factor on it in the first iteration, halved in each
 # steps over which learned lengths are compared with those by points, and their usual difference
 _NOISE_STEPS, _USUAL_NOISE = 20, 0.08
 _MOST_NOISE_BESIDE_ROAD = 2.0  # of learned lengths that a length by the road may contradict
 _UNIT_SIGMA = 0.2  # sigma of that scale by the learned ground plane
 _ACCELERATION_SIGMA = 3.0  # of a vehicle, in camera heights: 5 m/s2 at 1.65 m
+_RATE_STEPS = 101  # around a step that was not measured, whose frames are as long as theirs
 _SPEED_STEPS = 11  # window over which the speed is averaged that a change is compared with
 _LENGTH_SIGMA = 0.05  # of a single length where it is compared with the one before
 _CONTRADICTION_SIGMAS = 5.0
@@ -160,7 +163,7 @@ def find_scale(
     by_planes = scale_from_road(drive.roads, unit)
     prior_unit = _prior_unit(drive.roads, motions, absolute, by_planes, unit)
     steps = links(motions, frames)
-    evidence = gather_evidence(steps, motions, absolute, prior_unit, unit)
+    evidence = gather_evidence(steps, drive.steps, absolute, prior_unit, unit)
     if not isinstance(by_planes, Failed):
         # a car ahead taken for the road for seconds would outweigh all other measurements
         most = np.log(_MAX_CONTRADICTION) * min(evidence.learned_noise(), _MOST_NOISE_BESIDE_ROAD)
@@ -381,9 +384,9 @@ class StepEvidence:
     """Measurements of S steps, logarithms and their sigmas ``(S,)`` each, NaN where there is none.
 
     ``ratio`` is the length over that of the step before; ``absolute`` the length in the mode's
-    unit; ``learned`` the length by learned depth, already in the prior unit of the networks;
-    ``steady`` the length over that of the step before at constant speed, with the sigma that a
-    vehicle's acceleration gives it.
+    unit; ``learned`` the length by learned depth, already in the prior unit of the networks.
+    ``seconds`` are those of each step, also where it was not measured, NaN where the camera
+    stood or hardly moved; ``camera_height`` is in the mode's unit.
     """
 
     ratio: FloatArray
@@ -391,8 +394,8 @@ class StepEvidence:
     absolute: FloatArray
     absolute_sigma: FloatArray
     learned: FloatArray
-    steady: FloatArray
-    steady_sigma: FloatArray
+    seconds: FloatArray
+    camera_height: float
 
     def learned_noise(self) -> float:
         """How much more learned lengths err than on the roads that the network knows, at least 1.
@@ -409,10 +412,23 @@ class StepEvidence:
             return 1.0
         return max(float(np.sqrt(np.mean(over_steps**2))) / _USUAL_NOISE, 1.0)
 
+    def steady_sigma(self, log_length: FloatArray) -> FloatArray:
+        """By how much a vehicle's acceleration changes the logarithm of its speed from step to step ``(S - 1,)``.
+
+        Args:
+            log_length: of the steps ``(S,)``, which give the speed, NaN where unknown.
+        """
+        log_speed = running_median(log_length - np.log(self.seconds), _SPEED_STEPS)
+        usual = np.nanmedian(log_speed) if np.isfinite(log_speed).any() else np.nan
+        speed = np.exp(np.where(np.isfinite(log_speed), log_speed, usual))
+        duration = 0.5 * (self.seconds[1:] + self.seconds[:-1])
+        change = _ACCELERATION_SIGMA * self.camera_height * duration
+        return np.asarray(change / np.maximum(speed[1:], speed[:-1]))
+
     @classmethod
-    def empty(cls, steps: int) -> StepEvidence:
+    def empty(cls, steps: int, camera_height: float = 1.0) -> StepEvidence:
         """Without a measurement."""
-        return cls(*(np.full(steps, np.nan) for _ in range(7)))
+        return cls(*(np.full(steps, np.nan) for _ in range(6)), camera_height)
 
 
 @dataclass(frozen=True)
@@ -444,18 +460,17 @@ def gather_evidence(
 
     Args:
         links: consecutive steps.
-        motions: the triangulated ones.
+        motions: the measured ones.
         absolute: length in the mode's unit, and its relative sigma.
         prior_unit: that unit per unscaled length near each frame ``(N,)``.
         camera_height: in that unit.
     """
-    evidence = StepEvidence.empty(len(links))
-    seconds = np.full(len(links), np.nan)
+    evidence = StepEvidence.empty(len(links), camera_height)
     before: Motion | None = None
     for row, ends in enumerate(links):
         motion = motions.get(ends)
-        if motion is not None:
-            seconds[row] = motion.seconds
+        if motion is not None and motion.is_triangulated:
+            evidence.seconds[row] = motion.seconds
             evidence.learned[row] = np.log(motion.length_unscaled * prior_unit[ends[0]])
             if ends in absolute:
                 length, evidence.absolute_sigma[row] = absolute[ends]
@@ -463,15 +478,19 @@ def gather_evidence(
             if before is not None and motion.length_ratio is not None:
                 evidence.ratio[row], evidence.ratio_sigma[row] = motion.length_ratio
         before = motion
-    evidence.steady[1:] = np.log(seconds[1:] / seconds[:-1])
-    speed = np.exp(running_median(evidence.learned - np.log(seconds), _SPEED_STEPS))
-    changes = _ACCELERATION_SIGMA * camera_height * 0.5 * (seconds[1:] + seconds[:-1])
-    evidence.steady_sigma[1:] = changes / speed[1:]
+    frames = np.array([last - first for first, last in links])
+    usual = running_median(evidence.seconds / frames, _RATE_STEPS)
+    is_missed = np.array([ends not in motions for ends in links])
+    evidence.seconds[is_missed] = (usual * frames)[is_missed]
     return evidence
 
 
 def solve_lengths(evidence: StepEvidence) -> StepLengths:
-    """Robust least squares on all evidence: Huber weights first, then Cauchy weights against outliers."""
+    """Robust least squares on all evidence: Huber weights first, then Cauchy weights against outliers.
+
+    Of two explanations of a jump, that learned depth lost its unit is found before that a vehicle
+    leapt: the walk of the unit begins wide.
+    """
     steps = len(evidence.learned)
     lengths, units = 2 * np.arange(steps), 2 * np.arange(steps) + 1
     ratio_sigma = np.hypot(_RATIO_WIDENING * evidence.ratio_sigma, _RATIO_SIGMA)
@@ -479,33 +498,41 @@ def solve_lengths(evidence: StepEvidence) -> StepLengths:
     learned_sigma = noise * _LEARNED_SIGMA
     beside_road = np.where(np.isfinite(evidence.absolute), _BESIDE_ROAD, 1.0)
     ones = np.ones(steps)
+    steady = np.diff(np.log(evidence.seconds))
     zero = np.full(steps, 2 * steps)  # behind the last state
     # state[plus] - state[minus] = value, with a sigma: plus, minus, value, sigma
     parts = [
+        (lengths[1:], lengths[:-1], steady, evidence.steady_sigma(evidence.learned)),
+        (units[1:], units[:-1], 0.0 * ones[1:], noise * _UNIT_WALK_SIGMA * ones[1:]),
         (lengths[1:], lengths[:-1], evidence.ratio[1:], ratio_sigma[1:]),
         (lengths, zero, evidence.absolute, evidence.absolute_sigma),
         (lengths, units, evidence.learned, learned_sigma * beside_road),
-        (lengths[1:], lengths[:-1], evidence.steady[1:], evidence.steady_sigma[1:]),
-        (units[1:], units[:-1], 0.0 * ones[1:], noise * _UNIT_WALK_SIGMA * ones[1:]),
         # one prior on the unit of the whole drive, divided among its steps
         (units, zero, 0.0 * ones, _UNIT_SIGMA * np.sqrt(steps) * ones),
     ]
     measured = np.zeros(2 * steps, dtype=bool)
-    for state_of, _, value, _ in parts[:3]:
+    for state_of, _, value, _ in parts[2:5]:
         measured[state_of[np.isfinite(value)]] = True
-    idle = np.where(measured | (np.arange(2 * steps) % 2 == 1), 0.0, 1.0)
+    idle = np.where(measured | (np.arange(2 * steps) % 2 == 1), 0.0, _IDLE)
     plus, minus, value, sigma = (np.concatenate(column) for column in zip(*parts, strict=True))
+    of_speed, of_walk = slice(0, steps - 1), slice(steps - 1, 2 * steps - 2)
+    # between steps without a common point, no vehicle leaves the bound of its acceleration
+    is_bound = np.zeros(len(value), dtype=bool)
+    is_bound[of_speed] = np.isnan(evidence.ratio[1:])
     known = np.isfinite(value) & np.isfinite(sigma)
-    plus, minus, value, sigma = plus[known], minus[known], value[known], sigma[known]
+    value[~known], sigma[~known] = 0.0, np.inf
     state, weights = np.zeros(2 * steps + 1), np.ones(len(value))
     for iteration in range(_ITERATIONS):
+        weights[of_walk] /= max(_FIRST_WALK * 0.5**iteration, 1.0) ** 2
         information, right = _normal_equations(plus, minus, value, weights / sigma**2, idle)
         state[:-1] = solveh_banded(information, right)
+        speed_sigma = evidence.steady_sigma(state[lengths])
+        sigma[of_speed] = np.where(known[of_speed], speed_sigma, np.inf)
         residual = np.abs((state[plus] - state[minus] - value) / sigma)
-        robust = 1.0 / (1.0 + (residual / OUTLIER_SIGMAS) ** 2)
-        weights = (
-            1.0 / np.maximum(residual / _HUBER_K, 1.0) if iteration < _HUBER_ITERATIONS else robust
-        )
+        huber = 1.0 / np.maximum(residual / _HUBER_K, 1.0)
+        cauchy = 1.0 / (1.0 + (residual / OUTLIER_SIGMAS) ** 2)
+        weights = np.where(iteration < _HUBER_ITERATIONS, huber, cauchy)
+        weights[is_bound] = 1.0
     log_length, log_unit = state[lengths], state[units]
     of_measured = np.where(measured[lengths], 1.0, np.nan)
     sigmas, correlations = marginals(information)
@@ -513,10 +540,10 @@ def solve_lengths(evidence: StepEvidence) -> StepLengths:
         _CORRELATED_WIDENING * sigmas * np.sqrt((1.0 + correlations) / (1.0 - correlations))
     )
     sigmas, correlated_sigmas = of_measured * sigmas, of_measured * correlated_sigmas
-    by_learned = (evidence.learned + log_unit - log_length) / learned_sigma
-    by_speed = (np.diff(log_length, prepend=np.nan) - evidence.steady) / (
-        evidence.steady_sigma + _LENGTH_SIGMA
-    )
+    unit_before = np.concatenate([log_unit[:1], log_unit[:-1]])
+    by_learned = (evidence.learned + unit_before - log_length) / learned_sigma
+    change = (np.diff(log_length) - steady) / np.hypot(speed_sigma, _LENGTH_SIGMA)
+    by_speed = np.concatenate([[np.nan], change])
     contradicted = (np.abs(by_learned) > _CONTRADICTION_SIGMAS) | (
         np.abs(by_speed) > _CONTRADICTION_SIGMAS
     )

@@ -57,7 +57,11 @@ class Resection:
 
 
 def ransac_order(count: int, seed: int) -> NDArray[np.intp]:
-    """The order ``(count,)`` of the points for a RANSAC method of OpenCV's, whose seed is fixed; 0 is the given one."""
+    """The order ``(count,)`` of the points for a RANSAC method of OpenCV's; 0 is the given one.
+
+    Some methods have a fixed seed, others that of OpenCV, which is set too.
+    """
+    cv2.setRNGSeed(seed)
     order = np.arange(count, dtype=np.intp)
     return order if seed == 0 else np.random.default_rng(seed).permutation(order)
 
@@ -264,7 +268,6 @@ def unit_pose_by_essential(
     """
     order = ransac_order(len(rays_previous), seed)
     rays_previous, rays_current = rays_previous[order], rays_current[order]
-    cv2.setRNGSeed(seed)
     E, mask = cv2.findEssentialMat(
         rays_previous[:, :2].copy(),
         rays_current[:, :2].copy(),
@@ -307,7 +310,6 @@ def unit_poses_by_homography(
     """
     order = ransac_order(len(rays_previous), seed)
     rays_previous, rays_current = rays_previous[order], rays_current[order]
-    cv2.setRNGSeed(seed)
     H, mask = cv2.findHomography(
         rays_previous[:, :2].copy(),
         rays_current[:, :2].copy(),

@@ -150,8 +150,8 @@ def test_a_guessed_focal_length_comes_with_the_one_that_corners_show() -> None:
     guess = replace(CAMERA, fx=300.0, fy=300.0, focal_sigma=0.1)
     said = agreement.of_focal_length(found, guess)
     assert said is not None
-    true_fov = np.rad2deg(2 * np.arctan(CAMERA.width / (2 * CAMERA.fx)))
-    assert f"try fov={true_fov:.0f}" in said.figure
+    assert f"{100 * CAMERA.fx / 300.0:.0f} % of the given" in said.figure
+    assert "--camera auto" in said.figure
 
 
 def test_a_focal_length_that_nothing_measured_speaks_for_no_camera() -> None:

@@ -5,7 +5,7 @@ Lengths of all steps of a drive from ratios, road and learned depth.
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -44,9 +44,6 @@ RATIO_WIDENING, CORRELATED_WIDENING = (
     1.5,
 )  # of the sigmas of ratios, and of those in the pose graph
 TRUE = 1.0 + 0.3 * np.sin(np.arange(STEPS) / 15.0)
-
-
-EVIDENCE = [field.name for field in fields(StepEvidence)]
 
 
 def metres(ends: Ends) -> float:
@@ -276,8 +273,7 @@ def test_auto_stands_for_camera_height_where_it_is_known(configured, height, mod
 
 
 def evidence(**measured: np.ndarray) -> StepEvidence:
-    empty = {name: np.full(STEPS, np.nan) for name in EVIDENCE}
-    return StepEvidence(**(empty | measured))
+    return replace(StepEvidence.empty(STEPS), **measured)
 
 
 def ratios(noise: float = 0.0, seed: int = 0) -> dict[str, np.ndarray]:
@@ -459,11 +455,12 @@ def test_a_step_of_half_a_metre_between_metres_is_an_outlier() -> None:
     np.testing.assert_allclose(solved.length, 1.0, rtol=0.1)
 
 
-def test_a_stretch_of_half_metres_is_said() -> None:
-    """Learned depth alone cannot be overruled for ten steps, but no vehicle changes its speed so."""
+def test_a_stretch_of_half_metres_is_said_and_overruled() -> None:
+    """For ten steps learned depth loses its unit, but no vehicle changes its speed so."""
     solved = solve_lengths(driven(np.where((np.arange(60) >= 30) & (np.arange(60) < 40), 0.5, 1.0)))
     said = np.flatnonzero(solved.contradicted)
     assert len(said) and set(said) <= set(range(28, 43))
+    assert solved.length.max() / solved.length.min() < 1.15
 
 
 def test_a_car_may_brake() -> None:
@@ -471,4 +468,24 @@ def test_a_car_may_brake() -> None:
     metres = 0.1 * np.maximum(20.0 - 0.8 * np.arange(30), 1.0)
     solved = solve_lengths(driven(metres))
     assert not solved.contradicted.any()
-    np.testing.assert_allclose(solved.length[1:-1], metres[1:-1], rtol=0.1)
+    np.testing.assert_allclose(solved.length[1:-1], metres[1:-1], rtol=0.12)
+
+
+@pytest.mark.parametrize("stood", [False, True])
+def test_a_unit_that_learned_depth_loses_over_a_gap_is_held_by_the_speed(stood: bool) -> None:
+    """20 m/s, six steps that nobody measured, then learned depth of a third, tied by points; or a stop between.
+
+    Learned depth wanders, as on a road that the network does not know.
+    """
+    metres = np.where(np.arange(80) < 40, 2.0, 0.7) * np.exp(0.3 * np.sin(np.arange(80) / 6))
+    evidence = driven(metres)
+    evidence.ratio[1:], evidence.ratio_sigma[1:] = 0.0, 0.005
+    gap = slice(40, 46)
+    for values in (evidence.learned, evidence.ratio, evidence.ratio_sigma):
+        values[gap] = np.nan
+    evidence.ratio[46] = np.nan
+    evidence.absolute[:30], evidence.absolute_sigma[:30] = np.log(2.0), 0.02
+    if stood:
+        evidence.seconds[gap] = np.nan
+    after = solve_lengths(evidence).length[50:]
+    assert (after < 1.0).all() if stood else (after > 1.7).all()

@@ -163,12 +163,12 @@ def find_scale(
     by_planes = scale_from_road(drive.roads, unit)
     prior_unit = _prior_unit(drive.roads, motions, absolute, by_planes, unit)
     steps = links(motions, frames)
-    evidence = gather_evidence(steps, drive.steps, absolute, prior_unit, unit)
+    evidence = gather_evidence(steps, drive.steps, absolute, prior_unit)
     if not isinstance(by_planes, Failed):
         # a car ahead taken for the road for seconds would outweigh all other measurements
         most = np.log(_MAX_CONTRADICTION) * min(evidence.learned_noise(), _MOST_NOISE_BESIDE_ROAD)
         evidence.absolute[np.abs(evidence.absolute - evidence.learned) > most] = np.nan
-    solved = solve_lengths(evidence)
+    solved = solve_lengths(evidence, unit)
     row_at = np.searchsorted([first for first, _ in steps], np.arange(frames), side="right") - 1
     per_frame = prior_unit * solved.unit_correction[row_at]
     misfit = np.abs(evidence.absolute - np.log(solved.length))
@@ -386,7 +386,7 @@ class StepEvidence:
     ``ratio`` is the length over that of the step before; ``absolute`` the length in the mode's
     unit; ``learned`` the length by learned depth, already in the prior unit of the networks.
     ``seconds`` are those of each step, also where it was not measured, NaN where the camera
-    stood or hardly moved; ``camera_height`` is in the mode's unit.
+    stood or hardly moved.
     """
 
     ratio: FloatArray
@@ -395,7 +395,6 @@ class StepEvidence:
     absolute_sigma: FloatArray
     learned: FloatArray
     seconds: FloatArray
-    camera_height: float
 
     def learned_noise(self) -> float:
         """How much more learned lengths err than on the roads that the network knows, at least 1.
@@ -412,23 +411,24 @@ class StepEvidence:
             return 1.0
         return max(float(np.sqrt(np.mean(over_steps**2))) / _USUAL_NOISE, 1.0)
 
-    def steady_sigma(self, log_length: FloatArray) -> FloatArray:
+    def steady_sigma(self, log_length: FloatArray, camera_height: float) -> FloatArray:
         """By how much a vehicle's acceleration changes the logarithm of its speed from step to step ``(S - 1,)``.
 
         Args:
             log_length: of the steps ``(S,)``, which give the speed, NaN where unknown.
+            camera_height: in the mode's unit.
         """
         log_speed = running_median(log_length - np.log(self.seconds), _SPEED_STEPS)
         usual = np.nanmedian(log_speed) if np.isfinite(log_speed).any() else np.nan
         speed = np.exp(np.where(np.isfinite(log_speed), log_speed, usual))
         duration = 0.5 * (self.seconds[1:] + self.seconds[:-1])
-        change = _ACCELERATION_SIGMA * self.camera_height * duration
+        change = _ACCELERATION_SIGMA * camera_height * duration
         return np.asarray(change / np.maximum(speed[1:], speed[:-1]))
 
     @classmethod
-    def empty(cls, steps: int, camera_height: float = 1.0) -> StepEvidence:
+    def empty(cls, steps: int) -> StepEvidence:
         """Without a measurement."""
-        return cls(*(np.full(steps, np.nan) for _ in range(6)), camera_height)
+        return cls(*(np.full(steps, np.nan) for _ in range(6)))
 
 
 @dataclass(frozen=True)
@@ -454,7 +454,6 @@ def gather_evidence(
     motions: Mapping[Ends, Motion],
     absolute: Mapping[Ends, tuple[float, float]],
     prior_unit: FloatArray,
-    camera_height: float = 1.0,
 ) -> StepEvidence:
     """All measurements of the lengths of a drive's steps, one row a link.
 
@@ -463,9 +462,8 @@ def gather_evidence(
         motions: the measured ones.
         absolute: length in the mode's unit, and its relative sigma.
         prior_unit: that unit per unscaled length near each frame ``(N,)``.
-        camera_height: in that unit.
     """
-    evidence = StepEvidence.empty(len(links), camera_height)
+    evidence = StepEvidence.empty(len(links))
     before: Motion | None = None
     for row, ends in enumerate(links):
         motion = motions.get(ends)
@@ -485,11 +483,15 @@ def gather_evidence(
     return evidence
 
 
-def solve_lengths(evidence: StepEvidence) -> StepLengths:
+def solve_lengths(evidence: StepEvidence, camera_height: float = 1.0) -> StepLengths:
     """Robust least squares on all evidence: Huber weights first, then Cauchy weights against outliers.
 
     Of two explanations of a jump, that learned depth lost its unit is found before that a vehicle
     leapt: the walk of the unit begins wide.
+
+    Args:
+        evidence: of all steps.
+        camera_height: in the mode's unit, by which a vehicle's acceleration is known.
     """
     steps = len(evidence.learned)
     lengths, units = 2 * np.arange(steps), 2 * np.arange(steps) + 1
@@ -502,7 +504,7 @@ def solve_lengths(evidence: StepEvidence) -> StepLengths:
     zero = np.full(steps, 2 * steps)  # behind the last state
     # state[plus] - state[minus] = value, with a sigma: plus, minus, value, sigma
     parts = [
-        (lengths[1:], lengths[:-1], steady, evidence.steady_sigma(evidence.learned)),
+        (lengths[1:], lengths[:-1], steady, evidence.steady_sigma(evidence.learned, camera_height)),
         (units[1:], units[:-1], 0.0 * ones[1:], noise * _UNIT_WALK_SIGMA * ones[1:]),
         (lengths[1:], lengths[:-1], evidence.ratio[1:], ratio_sigma[1:]),
         (lengths, zero, evidence.absolute, evidence.absolute_sigma),
@@ -526,7 +528,7 @@ def solve_lengths(evidence: StepEvidence) -> StepLengths:
         weights[of_walk] /= max(_FIRST_WALK * 0.5**iteration, 1.0) ** 2
         information, right = _normal_equations(plus, minus, value, weights / sigma**2, idle)
         state[:-1] = solveh_banded(information, right)
-        speed_sigma = evidence.steady_sigma(state[lengths])
+        speed_sigma = evidence.steady_sigma(state[lengths], camera_height)
         sigma[of_speed] = np.where(known[of_speed], speed_sigma, np.inf)
         residual = np.abs((state[plus] - state[minus] - value) / sigma)
         huber = 1.0 / np.maximum(residual / _HUBER_K, 1.0)

@@ -446,18 +446,20 @@ def driven(metres: np.ndarray) -> StepEvidence:
     links = [(k, k + 1) for k in range(len(metres))]
     motions = {ends: motion(ends, metres[ends[0]], 0.1, 1.0, seconds=0.1) for ends in links}
     motions = {ends: replace(step, length_ratio=None) for ends, step in motions.items()}
-    return gather_evidence(links, motions, {}, np.full(len(metres) + 1, 10.0), camera_height=1.65)
+    return gather_evidence(links, motions, {}, np.full(len(metres) + 1, 10.0))
 
 
 def test_a_step_of_half_a_metre_between_metres_is_an_outlier() -> None:
-    solved = solve_lengths(driven(np.where(np.arange(60) == 30, 0.5, 1.0)))
+    solved = solve_lengths(driven(np.where(np.arange(60) == 30, 0.5, 1.0)), 1.65)
     assert np.flatnonzero(solved.contradicted).tolist() == [30]
     np.testing.assert_allclose(solved.length, 1.0, rtol=0.1)
 
 
 def test_a_stretch_of_half_metres_is_said_and_overruled() -> None:
     """For ten steps learned depth loses its unit, but no vehicle changes its speed so."""
-    solved = solve_lengths(driven(np.where((np.arange(60) >= 30) & (np.arange(60) < 40), 0.5, 1.0)))
+    solved = solve_lengths(
+        driven(np.where((np.arange(60) >= 30) & (np.arange(60) < 40), 0.5, 1.0)), 1.65
+    )
     said = np.flatnonzero(solved.contradicted)
     assert len(said) and set(said) <= set(range(28, 43))
     assert solved.length.max() / solved.length.min() < 1.15
@@ -466,7 +468,7 @@ def test_a_stretch_of_half_metres_is_said_and_overruled() -> None:
 def test_a_car_may_brake() -> None:
     """From 20 m/s at 8 m/s2 to 1 m/s."""
     metres = 0.1 * np.maximum(20.0 - 0.8 * np.arange(30), 1.0)
-    solved = solve_lengths(driven(metres))
+    solved = solve_lengths(driven(metres), 1.65)
     assert not solved.contradicted.any()
     np.testing.assert_allclose(solved.length[1:-1], metres[1:-1], rtol=0.12)
 
@@ -487,5 +489,5 @@ def test_a_unit_that_learned_depth_loses_over_a_gap_is_held_by_the_speed(stood: 
     evidence.absolute[:30], evidence.absolute_sigma[:30] = np.log(2.0), 0.02
     if stood:
         evidence.seconds[gap] = np.nan
-    after = solve_lengths(evidence).length[50:]
+    after = solve_lengths(evidence, 1.65).length[50:]
     assert (after < 1.0).all() if stood else (after > 1.7).all()

@@ -7,6 +7,7 @@ import logging
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -28,11 +29,12 @@ from slam.formats.ply import Ply
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image
 from slam.frames import Sequence as FrameSequence
+from slam.frontend.fixed_mask import FixedMask
 from slam.frontend.self_calibration import MOST_FRAMES, find_camera
 from slam.mapping.depth import KeyframeDepth
 from slam.mapping.surface import MapSurface
 from slam.pipeline.estimate import Estimate
-from slam.pipeline.run import Recorder, SlamPipeline, read_frame
+from slam.pipeline.run import Recorder, SlamPipeline, look_ahead, read_frame
 from slam.prediction.assembly import Prediction, open_prediction
 from slam.prediction.depth_source import FrameNumbers
 from slam.results.estimate_metrics import estimate_metrics, lidar_trajectory, timing_of
@@ -364,14 +366,15 @@ def open_recording(request: RunRequest) -> RecordedSequence:
     camera = recording.camera
     if asked is None or not is_auto(asked) or not isinstance(camera, CameraFile):
         return recording
-    total = min(len(recording), MOST_FRAMES)
+    total, fixed = min(len(recording), MOST_FRAMES), FixedMask()
+    look_ahead(recording, fixed)
 
     def frames() -> Iterator[Frame]:
         for index in range(total):
             request.progress("camera", index + 1, total)
             frame = read_frame(recording, index)
             if isinstance(frame, Frame):
-                yield frame
+                yield replace(frame, fixed=fixed.mask)
 
     found = find_camera(frames())
     said = found.sentence(camera.width)

@@ -255,7 +255,7 @@ def _overlap(support: FloatArray) -> tuple[float, str]:
 def of_focal_length(found: FocalLength, camera: Intrinsics) -> Agreement | None:
     """By the focal length that corners show; None where they show too little. A rough guess is a doubt in any case."""
     logarithm, sigma = found.error or (0.0, np.inf)
-    sigmas = abs(logarithm) / float(np.hypot(_FOCAL, sigma))
+    sigmas = abs(logarithm) / float(np.hypot(np.hypot(_FOCAL, sigma), camera.focal_sigma))
     is_guess = camera.focal_sigma > SURE
     figure = "nobody calibrated it" if is_guess else ""
     if sigma < _TELLING_FOCAL or sigmas > DOUBTFUL:

@@ -138,10 +138,14 @@ class Reconstruction:
 
 
 class Window(NamedTuple):
-    """What one window says: ``lens`` ``(5,)``, ``sigma`` of the first, and the largest turn of its axis."""
+    """What one window says: ``lens`` ``(5,)`` with its ``sigmas`` ``(5,)``, and the largest turn of its axis.
+
+    A window that does not turn says nothing of the focal length, whose sigma is infinite, but knows
+    how the lens bends the paths of its points.
+    """
 
     lens: FloatArray
-    sigma: float
+    sigmas: FloatArray
     turn_deg: float
 
 
@@ -174,25 +178,26 @@ def calibrated(seen: Sightings, pixel: float) -> Window | None:
     for _ in range(2):
         sigma = problem.spread(start, pixel)
         start, _ = problem.solved(start, _BUT_FOCAL, sigma, _FEW)
-    if (lowest := problem.lowest(start, sigma)) is None:
-        return None
-    start = lowest
+    lowest = problem.lowest(start, sigma)
+    free = _BUT_FOCAL if lowest is None else _ALL
+    start = lowest or start
     for _ in range(3):
-        start, _ = problem.solved(start, _ALL, sigma, _MANY)
+        start, _ = problem.solved(start, free, sigma, _MANY)
         problem, start = problem.without_outliers(start, 5.0, pixel)
         sigma = problem.spread(start, pixel)
-    start, _ = problem.solved(start, _ALL, sigma, _MANY)
+    start, _ = problem.solved(start, free, sigma, _MANY)
     if len(problem.seen) < _LEAST_SIGHTINGS:
         return None
     turn = np.linalg.norm(start.turns[:, :2], axis=1).max() + 1e-9
-    return Window(start.lens, problem.focal_sigma(start, sigma), float(np.rad2deg(turn)))
+    sigmas = problem.lens_sigmas(start, free, sigma)
+    return Window(start.lens, _INFLATED * sigmas, float(np.rad2deg(turn)))
 
 
 def joined(telling: Sequence[Window]) -> FoundCamera:
-    """The camera by windows, robustly, and a prior of its focal length; the prior's alone where they say too little."""
-    values = np.array([*(window.lens[0] for window in telling), _PRIOR[0]])
-    doubts = [math.hypot(_INFLATED * w.sigma, _FLOOR, _BY_TURN / w.turn_deg) for w in telling]
-    sigmas = np.array([*doubts, UNKNOWN_FX_SIGMA])
+    """The camera by windows, robustly, and a prior; the prior's focal length alone where they say too little."""
+    lenses = np.array([*(window.lens for window in telling), _PRIOR])
+    doubts = [math.hypot(w.sigmas[0], _FLOOR, _BY_TURN / w.turn_deg) for w in telling]
+    values, sigmas = lenses[:, 0], np.array([*doubts, UNKNOWN_FX_SIGMA])
     centre = weighted_median(values, sigmas**-2)
     for _ in range(10):
         near = np.maximum(np.abs(values - centre) / sigmas, 1e-9)
@@ -201,13 +206,18 @@ def joined(telling: Sequence[Window]) -> FoundCamera:
     disagree = float(weights @ (values - centre) ** 2) / len(values)
     sigma = float(np.hypot(np.sqrt(max(1.0, disagree) / weights.sum()), _SYSTEMATIC))
     if sigma > ROUGH:
-        focal = math.exp(_PRIOR[0])
-        return FoundCamera(focal, (0.0, 0.0), (0.0, 0.0), UNKNOWN_FX_SIGMA, 0, 0.0)
-    focal, own = math.exp(centre), weights[:-1]
-    first, second, x, y = (own @ np.array([w.lens[1:] for w in telling]) / own.sum()).tolist()
-    turn_deg = max(window.turn_deg for window in telling)
+        sigma, weights = (
+            UNKNOWN_FX_SIGMA,
+            np.array([*(w.sigmas[1] for w in telling), _PRIOR_SIGMAS[1]]) ** -2,
+        )
+        lens = _PRIOR + [0, 1, 1, 0, 0] * (weights @ lenses / weights.sum())
+    else:
+        lens = weights @ lenses / weights.sum()
+    _, first, second, x, y = lens.tolist()
+    focal = math.exp(lens[0])
+    seen = [window.turn_deg for window in telling if np.isfinite(window.sigmas[0])]
     radial = first * focal**2, second * focal**4
-    return FoundCamera(focal, radial, (x, y), sigma, len(telling), turn_deg)
+    return FoundCamera(focal, radial, (x, y), sigma, len(seen), max(seen, default=0.0))
 
 
 class Problem:
@@ -275,11 +285,12 @@ class Problem:
                 break
         return start, cost
 
-    def focal_sigma(self, given: Reconstruction, sigma: float) -> float:
-        """Formal sigma of the logarithm of the focal length."""
-        reduced, _, _ = _reduced(self._system(given, _ALL, sigma), 1e-10)
+    def lens_sigmas(self, given: Reconstruction, first: int, sigma: float) -> FloatArray:
+        """Formal sigmas of the lens ``(5,)``, with its values free from the ``first`` on, infinite before."""
+        reduced, _, _ = _reduced(self._system(given, first, sigma), 1e-10)
         covariance = np.linalg.pinv(reduced, hermitian=True, rcond=1e-13)
-        return float(np.sqrt(covariance[-5, -5]))
+        free = np.sqrt(np.diag(covariance)[first - 5 :])
+        return np.concatenate([np.full(first, np.inf), free])
 
     def _ideal(self, given: Reconstruction) -> tuple[FloatArray, FloatArray]:
         """Images without lens ``(S, 2)``, and points in their cameras ``(S, 3)``."""

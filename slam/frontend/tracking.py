@@ -480,7 +480,7 @@ def follow(frames: Iterable[Frame]) -> tuple[Sightings, float]:
         if before is not None:
             pixels, kept = track(before, frame.grey, pixels, CALIBRATION_SEARCH)
             inner = height - 2 * _BORDER_PX, width - 2 * _BORDER_PX
-            kept &= are_inside(pixels - _BORDER_PX, inner)
+            kept &= are_inside(pixels - _BORDER_PX, inner) & ~frame.is_fixed(pixels)
             pixels, ids = pixels[kept], ids[kept]
         before = frame.grey
         _, own, at_last = np.intersect1d(ids, last_ids, return_indices=True)

@@ -233,8 +233,9 @@ class SlamPipeline:
         total = len(self.sequence)
         ahead = read_ahead(partial(read_frame, self.sequence), range(total))
         with self.observer() as observer, closing(ahead) as read:
-            if frames is None and len(self.sequence) >= 2 * LEAST_IMAGES:
-                self._look_ahead(observer.fixed)
+            if frames is None:
+                with self._watch.stage("read"):
+                    look_ahead(self.sequence, observer.fixed)
             for index, frame in enumerate(self._watch.each("read", frames or read)):
                 observer.add(index, frame)
                 recorder.frame(observer)
@@ -244,15 +245,6 @@ class SlamPipeline:
             measured = observer.measured()
             warn_of_images(observer.gate, measured.fixed)
             return measured
-
-    def _look_ahead(self, fixed: FixedMask) -> None:
-        """Learn what is fixed to the camera from images of the first minute, before it spoils the first steps."""
-        last = min(len(self.sequence), _LOOKED_AHEAD) - 1
-        with self._watch.stage("read"):
-            for index in np.unique(np.linspace(0, last, _IMAGES_AHEAD).astype(int)).tolist():
-                frame = read_frame(self.sequence, index)
-                if isinstance(frame, Frame):
-                    fixed.look_at(frame.grey)
 
     def _leave_out_unseen(self, observed: Drive) -> None:
         """After an interrupted pass the sequence is what was seen."""
@@ -399,6 +391,17 @@ class SlamPipeline:
 
     def _trajectory(self, T_world_camera: FloatArray) -> Trajectory:
         return Trajectory(self.sequence.stamps, T_world_camera)
+
+
+def look_ahead(sequence: FrameSequence, fixed: FixedMask) -> None:
+    """Learn what is fixed to the camera from images of the first minute, before it spoils the first steps."""
+    last = min(len(sequence), _LOOKED_AHEAD) - 1
+    if last + 1 < 2 * LEAST_IMAGES:
+        return
+    for index in np.unique(np.linspace(0, last, _IMAGES_AHEAD).astype(int)).tolist():
+        frame = read_frame(sequence, index)
+        if isinstance(frame, Frame):
+            fixed.look_at(frame.grey)
 
 
 def read_frame(sequence: FrameSequence, index: int) -> Frame | SequenceError:

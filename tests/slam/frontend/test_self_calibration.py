@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import cv2
+import numpy as np
 import pytest
 
 from erfsfm.common.readers.camera_file import UNKNOWN_FX_SIGMA
@@ -37,3 +39,23 @@ def test_a_straight_street_says_that_it_cannot_be_seen() -> None:
     assert found.sigma == UNKNOWN_FX_SIGMA
     assert "cannot be seen: the camera does not turn" in found.sentence(WIDTH)
     assert "fov=65 is taken" in found.sentence(WIDTH)
+
+
+def test_a_lens_is_known_where_the_focal_length_is_not() -> None:
+    """A straight street through a lens that draws corners in by an eighth; it bends the paths of the points."""
+    straight = SimulationOptions(route="straight", frames=40, seed=11, width=WIDTH, height=208)
+    half, radial = WIDTH / 2, -0.12
+    K = np.array([[half, 0.0, half - 0.5], [0.0, half, 103.5], [0.0, 0.0, 1.0]])
+    pixels = np.mgrid[:208, :WIDTH][::-1].reshape(2, -1).T.astype(np.float64)
+    distortion = np.array([radial, 0.0, 0.0, 0.0])
+    ideal = cv2.undistortPoints(pixels, K, distortion, P=K).reshape(208, WIDTH, 2)
+
+    def bent() -> Iterator[Frame]:
+        for frame in images(straight, 0, 40):
+            image = cv2.remap(frame.image, ideal.astype(np.float32), None, cv2.INTER_LINEAR)
+            yield Frame(frame.index, frame.stamp, np.asarray(image, np.uint8))
+
+    found = find_camera(bent())
+    assert found.sigma == UNKNOWN_FX_SIGMA
+    first, second = found.radial[0] / found.focal**2, found.radial[1] / found.focal**4
+    assert first + second == pytest.approx(radial, abs=0.05)

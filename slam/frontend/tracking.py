@@ -506,8 +506,5 @@ def follow(frames: Iterable[Frame]) -> tuple[Sightings, float]:
 def _narrow(frame: Frame) -> Frame:
     """The same image, at most so wide that following its corners is quick."""
     height, width = frame.image.shape[:2]
-    if width <= _FOLLOWED_WIDTH_PX:
-        return frame
-    size = _FOLLOWED_WIDTH_PX, round(height * _FOLLOWED_WIDTH_PX / width)
-    small = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
-    return Frame(frame.index, frame.stamp, np.asarray(small, np.uint8), frame.fixed)
+    narrow = min(width, _FOLLOWED_WIDTH_PX)
+    return frame.resized(narrow, round(height * narrow / width))

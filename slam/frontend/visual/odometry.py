@@ -14,9 +14,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +23,6 @@ from slam.frames import (
     DepthMap,
     Ends,
     Frame,
-    Image,
     Intrinsics,
     RelativePose,
     nearest_depth,
@@ -136,8 +134,8 @@ class VisualOdometry:
             height_unscaled: camera height in the same unit; where known, depths of more than
                 30 times as much are not trusted.
         """
-        previous, current = self._reduced(previous), self._reduced(current)
-        depth_previous_unscaled = self._reduced_depth(depth_previous_unscaled)
+        previous, current = previous.resized(*self._size), current.resized(*self._size)
+        depth_previous_unscaled = resized_depth(depth_previous_unscaled, *self._size)
         last, flow = self._last, None
         # by the constant-velocity model, if the last motion ended at the earlier frame and spans as
         # many frames
@@ -168,7 +166,7 @@ class VisualOdometry:
 
         None where nothing moved.
         """
-        depth = self._reduced_depth(depth_previous_unscaled)
+        depth = resized_depth(depth_previous_unscaled, *self._size)
         flow = PredictedFlow.of(motion.relative_pose.T_from_to, depth, self._intrinsics)
         return None if flow is None else flow.depth_current()
 
@@ -181,8 +179,8 @@ class VisualOdometry:
             A function that measures it from the present state, in any thread; its result is None
             with too few corners.
         """
-        first, last = self._reduced(first), self._reduced(last)
-        depth_first_unscaled = self._reduced_depth(depth_first_unscaled)
+        first, last = first.resized(*self._size), last.resized(*self._size)
+        depth_first_unscaled = resized_depth(depth_first_unscaled, *self._size)
         flow = PredictedFlow.of(T_first_last, depth_first_unscaled, self._intrinsics)
         if flow is None:
             return lambda: None
@@ -410,25 +408,6 @@ class VisualOdometry:
         sigmas = np.hypot(CORNER_CORRELATION * resection.sigmas, floors)
         pose = RelativePose(*ends, invert(resection.T_camera_world), sigmas, PNP_SOURCE)
         return Motion(pose, support=count / tracks.sought)
-
-    def _reduced(self, frame: Frame) -> Frame:
-        """The frame with an image of at most a megapixel."""
-
-        def reduced() -> Frame:
-            image: Image = np.asarray(
-                cv2.resize(frame.image, self._size, interpolation=cv2.INTER_AREA), np.uint8
-            )
-            return replace(frame, image=image)
-
-        return (
-            frame
-            if frame.image.shape[1::-1] == self._size
-            else frame.derived(("reduced", self._size), reduced)
-        )
-
-    def _reduced_depth(self, depth: DepthMap) -> DepthMap:
-        """The depth map ``(h, w)`` of the reduced image."""
-        return depth if depth.shape[::-1] == self._size else resized_depth(depth, *self._size)
 
 
 @dataclass(frozen=True)

@@ -98,6 +98,17 @@ class Frame:
             return np.zeros(len(pixels), np.bool_)
         return nearest(resized_mask(self.fixed, *self.image.shape[1::-1]), pixels)
 
+    def resized(self, width: int, height: int) -> Frame:
+        """The same in another size, smaller or its own."""
+        size = width, height
+
+        def resized() -> Frame:
+            image = cv2.resize(self.image, size, interpolation=cv2.INTER_AREA)
+            return replace(self, image=np.asarray(image, np.uint8))
+
+        is_own = self.image.shape[1::-1] == size
+        return self if is_own else self.derived(("resized", size), resized)
+
     @property
     def grey(self) -> Grey:
         """Grey levels ``(H, W)`` uint8."""
@@ -359,6 +370,8 @@ def sampled_depth(depth: DepthMap, u: NDArray[np.float32], v: NDArray[np.float32
 
 def resized_depth(depth: DepthMap, width: int, height: int) -> DepthMap:
     """The depth map ``(height, width)`` of an image resized to so many pixels, as `sampled_depth`."""
+    if depth.shape == (height, width):
+        return depth
     u, v = (
         ((np.arange(to, dtype=np.float32) + 0.5) * (of / to) - 0.5).astype(np.float32)
         for to, of in ((width, depth.shape[1]), (height, depth.shape[0]))
@@ -370,6 +383,16 @@ def resized_mask(mask: Mask, width: int, height: int) -> Mask:
     """The mask ``(height, width)`` of an image resized to so many pixels."""
     resized = cv2.resize(mask.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
     return np.asarray(resized, bool)
+
+
+def shrunk(grey: Grey, ratio: int) -> NDArray[np.float32]:
+    """Grey levels ``(h, w)`` of an image of ``ratio`` times this size.
+
+    Without the last rows and columns that fill no pixel: whole pixels are averaged ten times as fast.
+    """
+    height, width = (max(side // ratio, 1) for side in grey.shape)
+    whole = grey[: ratio * height, : ratio * width]
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def slopes_of(image: NDArray[np.float32]) -> list[NDArray[np.float32]]:

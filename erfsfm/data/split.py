@@ -314,6 +314,7 @@ def _without_stops(recordings: list[Recording]) -> list[Recording]:
         logger.info("left out %d of %d frames in which the camera stands still", lost, before)
     if recordings and not kept:
         raise DataError(
-            "the camera stands still in every frame found: nothing can be learned from them"
+            "the camera stands still in every frame found: nothing can be learned from them; if it moves slowly, "
+            "or was recorded at a high rate, give a folder with every n-th image, a tenth of a second apart"
         )
     return kept

@@ -113,11 +113,19 @@ class SelfSupervision(lightning.LightningModule):
                 "already; the weights so far are in last/"
             )
         self._constant_steps = self._constant_steps + 1 if spread < _CONSTANT else 0
-        if self._constant_steps == _CONSTANT_STEPS:
+        self.require_depth(_CONSTANT_STEPS)
+
+    def require_depth(self, steps: int = 1) -> None:
+        """Refuse a depth that has been constant for the last ``steps``.
+
+        Raises:
+            TrainingError: it has.
+        """
+        if self._constant_steps >= steps:
             raise TrainingError(
-                f"the depth has been one constant for {_CONSTANT_STEPS} steps (spread {spread:.1g} at step "
-                f"{self.global_step}): nothing is learned from it; lower training.learning_rate or "
-                "loss.smoothness_weight and start again; the weights so far are in last/"
+                f"the depth has been one constant for {self._constant_steps} steps at step {self.global_step}: "
+                "nothing is learned from it; lower training.learning_rate or loss.smoothness_weight and start "
+                "again; the weights so far are in last/"
             )
 
     def train(self, mode: bool = True) -> Self:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import os
+import shutil
 import signal
 import sys
 import tempfile
@@ -51,6 +52,8 @@ logger = logging.getLogger(__name__)
 _LOGGED_EVERY = (
     50  # steps: a hundredth of the shortest useful training; a shorter one is logged at its end
 )
+_BATCHES_AHEAD = 2  # of each data loader, by PyTorch
+_LABEL_BYTES = 12  # of a pixel: bounds of depth, and where they are known
 _LEFT_OUT = ("method", "leak")  # the same in all rows
 
 
@@ -97,7 +100,7 @@ def train(
     timer = Timer(
         timedelta(minutes=config.training.minutes) or None, verbose=False
     )  # keeps its time in checkpoints
-    module = SelfSupervision(config, timer.time_elapsed)
+    module, workers = SelfSupervision(config, timer.time_elapsed), _workers(config)
     draws = _draws(config, training, done_steps, output, progress)
     validation_loader = (
         DataLoader(ValidationSnippets(validation, config), 1) if validation else None
@@ -110,11 +113,7 @@ def train(
     if resume:
         module.validation_metrics = keeper.metrics_at(done_steps)
     loader = DataLoader(
-        draws,
-        config.training.batch,
-        num_workers=config.data.workers,
-        pin_memory=not on_cpu,
-        collate_fn=stacked,
+        draws, config.training.batch, num_workers=workers, pin_memory=not on_cpu, collate_fn=stacked
     )
     trainer = _trainer(config, output, device, (keeper, timer, StepProgress(progress)), done_steps)
     with raising_on_termination(), FolderLock() as lock:
@@ -125,6 +124,7 @@ def train(
     keeper.save(trainer, module)
     if not trainer.is_global_zero:
         sys.exit()
+    module.require_depth()
     return output
 
 
@@ -178,6 +178,27 @@ def depth_before_and_after(
             for row in errors
         ]
     return rows
+
+
+def _workers(config: ExperimentConfig) -> int:
+    """Data loaders that fit into shared memory, where each hands over batches: in containers it is small.
+
+    One for which there is no room would end, and the training would wait for it for ever.
+    """
+    workers, network, shared = config.data.workers, config.network, Path("/dev/shm")
+    if not workers or not shared.is_dir():
+        return workers
+    sample = network.height * network.width * (3 * (network.sources + 1) + _LABEL_BYTES)
+    wanted = (_BATCHES_AHEAD * workers + 1) * config.training.batch * sample
+    free = shutil.disk_usage(shared).free
+    if wanted < free:
+        return workers
+    logger.warning(
+        "/dev/shm has %.1f MB free, and %d data loaders want %.1f: the training reads its data itself, "
+        "which is slower; start the container with --shm-size=2g, or set data.workers=0",
+        *(free / 1e6, workers, wanted / 1e6),
+    )
+    return 0
 
 
 def _draws(

@@ -19,6 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from erfsfm.common.errors import one_line
 from erfsfm.common.files import read_text, refuse_foreign
 from erfsfm.common.processes import slam_process
 from erfsfm.common.progress import Progress
@@ -163,7 +164,7 @@ def run_drives(
     progress("drives", 0, len(drives))
     for number, result in spread(work, drives, min(count, len(drives)), scheduler):
         if not isinstance(result, Outcome):
-            reason = " ".join(f"{type(result).__name__}: {result}".split())
+            reason = one_line(f"{type(result).__name__}: {result}")
             result = Outcome(drives[number], output / drives[number].name, "failed", reason)
         outcomes[number] = result
         progress("drives", len(outcomes), len(drives))
@@ -206,7 +207,7 @@ def spread(
         )
     except (OSError, ValueError) as error:
         raise SlamError(
-            f"no Dask scheduler answers at {scheduler}: {' '.join(str(error).split())}"
+            f"no Dask scheduler answers at {scheduler}: {one_line(str(error))}"
         ) from error
     with client:
         futures = client.map(work, drives, pure=False)
@@ -246,12 +247,8 @@ def check_output(output: Path, drives: Sequence[Drive]) -> None:
 
 def summary_table(outcomes: Sequence[Outcome]) -> Table:
     """The main numbers of the runs that are whole, and why others failed."""
-    shown: dict[str, int] = {}
-    for name, (_, decimals) in _COLUMNS.items():
-        if decimals is not None:
-            shown[name] = decimals
-    rows = []
-    notes = []
+    shown = {name: places for name, (_, places) in _COLUMNS.items() if places is not None}
+    rows, notes = [], []
     for outcome in outcomes:
         if outcome.status == "failed":
             notes.append(f"{outcome.drive.name} failed: {outcome.reason}")
@@ -345,17 +342,11 @@ def _is_whole(folder: Path, arguments: list[str]) -> bool:
 
 
 def _row(outcome: Outcome) -> dict[str, Any]:
-    row: dict[str, Any] = {
-        "drive": outcome.drive.name,
-        "status": outcome.status,
-        "reason": outcome.reason,
-    }
+    row = {"drive": outcome.drive.name, "status": outcome.status, "reason": outcome.reason}
     if outcome.status == "failed":
         return row | dict.fromkeys(_COLUMNS)
     metrics = RunFolder(outcome.folder).metrics()
-    for name, (value, _) in _COLUMNS.items():
-        row[name] = value(metrics)
-    return row
+    return row | {name: value(metrics) for name, (value, _) in _COLUMNS.items()}
 
 
 def _end_with_the_worker() -> None:

@@ -311,10 +311,11 @@ def localize(
         write_localisations(output, found)
     if as_json:
         typer.echo(json.dumps([each.tree() for each in found], indent=2))
-        return
-    localisation_table(found).print()
-    for note in run_folder.metrics().unit_notes():
-        typer.echo(note)
+    else:
+        localisation_table(found).print()
+        for note in run_folder.metrics().unit_notes():
+            typer.echo(note)
+    raise typer.Exit(all(each.T_world_camera is None for each in found))
 
 
 @app.command()

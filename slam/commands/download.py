@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from erfsfm.common.errors import one_line
 from erfsfm.common.progress import Progress
 from slam.runtime.errors import SlamError
 from slam.runtime.files import write_atomically
@@ -172,4 +173,4 @@ def _cause(error: BaseException) -> str:
         if isinstance(first, OSError) and first.strerror:
             return first.strerror
         first = first.__context__
-    return " ".join(f"{type(error).__name__}: {error}".split())
+    return one_line(f"{type(error).__name__}: {error}")

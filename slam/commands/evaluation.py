@@ -122,18 +122,19 @@ def named_paths(words: Sequence[str]) -> list[tuple[str, Path]]:
             pattern (``orb=runs/orb_*.txt``); all paths of one NAME are of one system.
     """
     found: list[tuple[str, Path]] = []
+    plain = []
     for word in words:
         name, _, pattern = word.rpartition("=")
-        if not name or Path(word).exists():
-            path = Path(word)
-            found.append((path.resolve().name if path.is_dir() else path.stem, path))
+        path = Path(word)
+        if not name or path.exists():
+            plain.append(path.resolve().name if path.is_dir() else path.stem)
+            found.append((plain[-1], path))
             continue
         # brackets may be those of a name; Path.glob takes no whole path
         paths = [pattern] if Path(pattern).exists() else sorted(glob(pattern))  # noqa: PTH207
         if not paths:
             raise RunError(f"{word}: no file or folder is named {pattern}")
         found += [(name, Path(path)) for path in paths]
-    plain = [name for (name, _), word in zip(found, words) if Path(word).exists()]
     return [(str(path) if plain.count(name) > 1 else name, path) for name, path in found]
 
 

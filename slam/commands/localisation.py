@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
@@ -20,7 +19,8 @@ from erfsfm.common.readers.numbering import in_order
 from erfsfm.common.table import DASH, Table
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.frames import Frame, Image, Intrinsics, View
-from slam.geometry.multiview import consensus, resect
+from slam.geometry.multiview import Resection, consensus, pixel_jacobian, resect
+from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray, apply, invert
 from slam.loops.features import FeatureExtractor, hamming
 from slam.loops.places import Places, PlaceStructure
@@ -43,6 +43,9 @@ _LEAST_POINTS = 8  # of a place, to try it
 _LEAST_INLIERS = 30
 _LEAST_RATIO = 0.5
 _MOST_SIGMA = 0.01  # of the position, over the depth of the points
+# of the focal length, beyond which the image is by another lens: corners show one that is a tenth longer
+# as 5 to 9 %, and their own to 1 %
+_LONGER = 0.02
 _ASPECT_TOLERANCE = 0.01
 
 
@@ -193,7 +196,7 @@ class Localiser:
             return Localisation(name, reason="no place of the map is similar")
         learned = self._structure.confirms_depth(rows)
         found = self._found(rows, view, learned)
-        if found.T_world_camera is None:
+        if not found.inliers:
             found = self._found(rows, view, not learned)
         if found.T_world_camera is None:
             return Localisation(name, reason=f"{len(rows)} similar places; {found.reason}")
@@ -213,12 +216,8 @@ class Localiser:
                 raise SequenceError(
                     f"the image is {width}x{height}, its camera {camera.width}x{camera.height}: give its --camera"
                 )
-            image = np.asarray(
-                cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA),
-                np.uint8,
-            )
-        no_depth = np.full(image.shape[:2], np.nan, np.float32)
-        return self._features.view(Frame(0, 0.0, image), no_depth)
+        frame = Frame(0, 0.0, image).resized(camera.width, camera.height)
+        return self._features.view(frame, np.full(frame.grey.shape, np.nan, np.float32))
 
     def _found(self, rows: list[int], view: View, learned: bool) -> Localisation:
         """The pose with most corners of the map around it, of those by the places with most inliers; or why not."""
@@ -244,16 +243,20 @@ class Localiser:
             T_camera_world = pose.T_camera_world
         inliers = pose.residual_px < self._thresholds.reprojection_px
         count = int(inliers.sum())
-        if count < max(_LEAST_INLIERS, self._thresholds.min_inliers) or count < _LEAST_RATIO * len(
-            inliers
-        ):
+        if count < max(_LEAST_INLIERS, _LEAST_RATIO * len(inliers)):
             return Localisation(reason=f"only {count} of {len(inliers)} corners agree")
-        depth = float(np.median(apply(T_camera_world, points[inliers])[:, 2]))
+        points, pixels = points[inliers], pixels[inliers]
+        depth = float(np.median(apply(T_camera_world, points)[:, 2]))
         sigma = float(np.linalg.norm(pose.sigmas[3:])) / depth
         if sigma > _MOST_SIGMA:
             return Localisation(
                 reason=f"{count} corners agree, but give the position to {sigma:.1%} of their depth"
             )
+        longer, sigma = _longer(pose, points, pixels, self._intrinsics)
+        if abs(longer) > _LONGER + 3.0 * sigma:
+            times = f"{np.exp(longer):.2f} times the focal length of its camera"
+            reason = f"{count} corners agree, but want {times}: give its --camera"
+            return Localisation(reason=reason, inliers=count)
         return Localisation(T_world_camera=invert(T_camera_world), inliers=count)
 
     def _start(self, row: int, view: View, learned: bool) -> tuple[FloatArray, NDArray[np.intp]]:
@@ -292,6 +295,19 @@ class Localiser:
         best = differing.argmin(axis=1)
         corners = np.flatnonzero(differing[np.arange(len(view)), best] <= _MOST_DIFFERING)
         return points[best[corners]], view.pixels[corners].astype(np.float64)
+
+
+def _longer(
+    pose: Resection, points: FloatArray, pixels: FloatArray, camera: Intrinsics
+) -> tuple[float, float]:
+    """By how much a focal length that is free beside the pose is longer, as a logarithm, and its sigma."""
+    X = apply(pose.T_camera_world, points)
+    seen = camera.project(X)
+    by_focal = (seen - (camera.cx, camera.cy)).T[None]
+    by_pose = pixel_jacobian(X, np.array([camera.fx, camera.fy]))
+    J, residual = np.concatenate([by_pose, by_focal]).reshape(7, -1), (pixels - seen).T.ravel()
+    covariance = np.linalg.inv(J @ J.T)
+    return float(covariance[6] @ J @ residual), mad_sigma(residual) * float(covariance[6, 6]) ** 0.5
 
 
 def _image_paths(images: Path) -> list[Path]:

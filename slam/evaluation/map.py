@@ -282,7 +282,7 @@ def compare(
     together = {
         name: MapDistances(*map(np.concatenate, zip(*each))) for name, each in found.items()
     }
-    to_next = np.append(np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1), 0.0)
+    to_next = np.append(np.diff(path_distance(T_world_camera)), 0.0)
     return together, float(sum(to_next[part].sum() for part in parts))
 
 

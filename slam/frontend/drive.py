@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from typing import Any, TypeVar
 
-import cv2
 import numpy as np
 
 from slam.frames import (
@@ -55,11 +54,7 @@ class Keyframe:
         height, width = frame.image.shape[:2]
         ratio = min(MAP_WIDTH_PX / width, 1.0)
         size = (max(round(width * ratio), 1), max(round(height * ratio), 1))
-        image, depth = frame.image, depth_unscaled
-        if depth.shape[::-1] != size:
-            depth = resized_depth(depth, *size)
-        if ratio < 1.0:
-            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        image, depth = frame.resized(*size).image, resized_depth(depth_unscaled, *size)
         return cls(frame.index, spill_file.put(image), spill_file.put(depth))
 
     @property

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import Grey, Mask, slopes_of
+from slam.frames import Grey, Mask, shrunk, slopes_of
 from slam.geometry.robust import running_median
 
 LEAST_IMAGES = 20  # before which nothing is said
@@ -157,10 +157,7 @@ def _below_broad_edges(edges: NDArray[np.uint8], world: Mask, least_width: float
 
 def _local(grey: Grey) -> _Layer:
     """The image in a smaller size, without what changes slowly over it."""
-    ratio = math.ceil(grey.shape[1] / _WIDTH_PX)
-    height, width = (max(side // ratio, 1) for side in grey.shape)
-    whole = grey[: ratio * height, : ratio * width]
-    small = np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+    small = shrunk(grey, math.ceil(grey.shape[1] / _WIDTH_PX))
     return np.asarray(small - cv2.GaussianBlur(small, (0, 0), _LOCAL_PX), np.float32)
 
 

@@ -129,9 +129,7 @@ class GpsFixes:
             next((s for s in spans if metres * np.median(chords(s)[1]) >= good), longest)
         )
         usable = metres * by_camera > least
-        ratios = by_gps[usable] / by_camera[usable]
-        value = float(np.median(ratios))
-        return ScaleEstimate(value, mad_sigma(np.log(ratios / value)), int(usable.sum()))
+        return _usual(by_gps[usable] / by_camera[usable])
 
     def _by_speeds(self, T_world_camera: FloatArray) -> ScaleEstimate | None:
         """The scale by what was driven at the stated speeds; None without any, or where too few tenths move."""
@@ -146,9 +144,7 @@ class GpsFixes:
         usable = (by_gps > _LEAST_SPEED_M_S * np.diff(self.stamps[edges])) & (by_camera > 0)
         if usable.sum() < MIN_FRAMES:
             return None
-        ratios = by_gps[usable] / by_camera[usable]
-        value = float(np.median(ratios))
-        return ScaleEstimate(value, mad_sigma(np.log(ratios / value)), int(usable.sum()))
+        return _usual(by_gps[usable] / by_camera[usable])
 
     def align(self, T_world_camera: FloatArray) -> FloatArray | Failed:
         """``T_enu_world`` ``(4, 4)`` by the fixes, robustly; about a straight path by the camera's own up."""
@@ -272,6 +268,12 @@ class LocalFrame:
             - normal * (1.0 - _E2 * np.sin(latitude) ** 2)
         )
         return np.column_stack([np.rad2deg(latitude), np.rad2deg(np.arctan2(y, x)), height])
+
+
+def _usual(ratios: FloatArray) -> ScaleEstimate:
+    """The median of lengths by GPS over those by the camera ``(M,)``."""
+    value = float(np.median(ratios))
+    return ScaleEstimate(value, mad_sigma(np.log(ratios / value)), len(ratios))
 
 
 def _earth_centred(places: FloatArray) -> FloatArray:

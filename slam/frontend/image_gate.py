@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import Frame, Grey, slopes_of
+from slam.frames import Frame, shrunk, slopes_of
 from slam.runtime.errors import Failed
 
 _THUMBNAIL = (32, 16)  # width, height
@@ -68,40 +68,33 @@ class ImageGate:
             # images after a dark one are not compared with those before it
             self._shrunk, self._difference = None, 0.0
             return Failed("the image is blank")
-        shrunk = _shrunk(frame.grey)
-        thumbnail = cv2.resize(shrunk, _THUMBNAIL, interpolation=cv2.INTER_AREA)
+        small = shrunk(frame.grey, _SHRINKING)
+        thumbnail = cv2.resize(small, _THUMBNAIL, interpolation=cv2.INTER_AREA)
         if float(thumbnail.std()) < _NOISE_CONTRAST * contrast:
             return Failed("the image is noise")
-        return self._compared(shrunk)
+        return self._compared(small)
 
-    def _compared(self, shrunk: _Layer) -> Verdict:
+    def _compared(self, small: _Layer) -> Verdict:
         """Compare an image with the last new one: its exposure, and whether it is a re-encoded copy of it.
 
         A copy is frozen where the camera moved just before: a camera that comes to a stop slows
         down first.
         """
         before = self._shrunk
-        if before is None or before.shape != shrunk.shape:
-            self._shrunk, self._difference = shrunk, 0.0
+        if before is None or before.shape != small.shape:
+            self._shrunk, self._difference = small, 0.0
             return "new"
         is_exposed = (
-            abs(float(np.log((np.median(shrunk) + 1.0) / (np.median(before) + 1.0))))
+            abs(float(np.log((np.median(small) + 1.0) / (np.median(before) + 1.0))))
             > _EXPOSURE_STEP
         )
         self.compared, self.exposed = self.compared + 1, self.exposed + is_exposed
-        difference = _difference(before, shrunk)
+        difference = _difference(before, small)
         largest = max(_REPEAT_DIFFERENCE, _COPY_OVER_MOTION * self._difference)
         if difference < min(largest, _LARGEST_COPY * _REPEAT_DIFFERENCE) and self.was_moving:
             return "repeated"
-        self._shrunk, self._difference = shrunk, difference
+        self._shrunk, self._difference = small, difference
         return "new"
-
-
-def _shrunk(grey: Grey) -> _Layer:
-    """Without the last rows and columns that fill no pixel: whole pixels are averaged ten times as fast."""
-    height, width = (max(side // _SHRINKING, 1) for side in grey.shape)
-    whole = grey[: _SHRINKING * height, : _SHRINKING * width]
-    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _difference(before: _Layer, now: _Layer) -> float:

@@ -31,7 +31,7 @@ from slam.frontend.drive import Drive
 from slam.frontend.road import RoadStep
 from slam.frontend.visual.motion import Motion, links, triangulated
 from slam.geometry.robust import mad_sigma, running_median
-from slam.geometry.se3 import FloatArray
+from slam.geometry.se3 import FloatArray, path_distance
 from slam.runtime.errors import Failed, SlamError
 
 LengthUnit = Literal["metres", "camera heights", "no metric unit", "the networks' own unit"]
@@ -288,19 +288,14 @@ def scale_from_reference(
     T_world_camera_unscaled: FloatArray, T_world_camera_true: FloatArray
 ) -> ScaleEstimate | Failed:
     """True path length over estimated path length of the first 50 frames."""
-    estimated = _step_lengths(T_world_camera_unscaled[:_REFERENCE_FRAMES])
-    true = _step_lengths(T_world_camera_true[:_REFERENCE_FRAMES])
+    estimated = np.diff(path_distance(T_world_camera_unscaled[:_REFERENCE_FRAMES]))
+    true = np.diff(path_distance(T_world_camera_true[:_REFERENCE_FRAMES]))
     if estimated.sum() <= 0 or true.sum() <= 0:
         return Failed(f"the camera does not move within the first {_REFERENCE_FRAMES} frames")
     value = float(true.sum() / estimated.sum())
     moving = estimated > 0.1 * estimated.mean()
     spread = float(np.std(true[moving] / estimated[moving] / value))
     return ScaleEstimate(value, spread, len(estimated) + 1)
-
-
-def _step_lengths(T_world_camera: FloatArray) -> FloatArray:
-    """Lengths ``(N - 1,)`` of the steps of a path ``(N, 4, 4)``."""
-    return np.asarray(np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1))
 
 
 def known_frames(config: ScaleConfig, stamps: FloatArray) -> tuple[int, int]:

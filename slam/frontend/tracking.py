@@ -38,6 +38,7 @@ _PREDICTED_LEVELS = 2
 _ACROSS_PX = 1.0  # largest error of a corner over several steps, by the way across and step by step
 # steps between frames whose rotation is also measured directly: halves its error
 ROTATION_BASELINE = 2
+LONGEST_STEP = 30  # frames across which corners are compared where nothing can be told apart
 # tracks below which they are sought again, with the wide window and equal exposure
 FEW_CORNERS = 60
 _FOLLOWED, _FOLLOWED_WIDTH_PX, _BORDER_PX = 500, 960, 8.0
@@ -289,7 +290,7 @@ class CornerTracker:
             np.concatenate([track_ids, new_ids]),
         )
         self._next_track_id += len(fresh)
-        for index in sorted(self._corners)[: -ROTATION_BASELINE - 2]:
+        for index in sorted(self._corners)[: -LONGEST_STEP - 2]:
             del self._corners[index]
 
 
@@ -505,8 +506,5 @@ def follow(frames: Iterable[Frame]) -> tuple[Sightings, float]:
 def _narrow(frame: Frame) -> Frame:
     """The same image, at most so wide that following its corners is quick."""
     height, width = frame.image.shape[:2]
-    if width <= _FOLLOWED_WIDTH_PX:
-        return frame
-    size = _FOLLOWED_WIDTH_PX, round(height * _FOLLOWED_WIDTH_PX / width)
-    small = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
-    return Frame(frame.index, frame.stamp, np.asarray(small, np.uint8), frame.fixed)
+    narrow = min(width, _FOLLOWED_WIDTH_PX)
+    return frame.resized(narrow, round(height * narrow / width))

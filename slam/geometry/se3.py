@@ -82,7 +82,12 @@ def interpolate(T_world_camera: FloatArray, known: FloatArray, stamps: FloatArra
 
 def path_distance(T_world_camera: FloatArray) -> FloatArray:
     """Distance travelled ``(N,)`` up to each of the poses ``(N, 4, 4)``."""
-    steps = np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1)
+    return distance_along(T_world_camera[:, :3, 3])
+
+
+def distance_along(points: FloatArray) -> FloatArray:
+    """Distance along a polyline ``(N,)`` up to each of its points ``(N, D)``."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 

@@ -29,10 +29,10 @@ from slam.frontend.fixed_mask import FixedMask
 from slam.frontend.ground_plane import GroundPlaneFitter
 from slam.frontend.image_gate import ImageGate, Verdict
 from slam.frontend.road import RoadHomography, RoadStep
-from slam.frontend.tracking import ROTATION_BASELINE
+from slam.frontend.tracking import LONGEST_STEP, ROTATION_BASELINE
 from slam.frontend.visual.motion import Motion, path_between, shortest_by_start
-from slam.frontend.visual.odometry import VisualOdometry
-from slam.geometry.se3 import chain, is_se3
+from slam.frontend.visual.odometry import PNP_SOURCE, VisualOdometry
+from slam.geometry.se3 import FloatArray, chain, invert, is_se3
 from slam.loops.features import FeatureExtractor
 from slam.pipeline.front_end_choice import KeyframeTracking
 from slam.runtime.errors import Failed, MissingFrameError, SequenceError, SlamError
@@ -43,6 +43,9 @@ logger = logging.getLogger(__name__)
 
 _NO_POSE = "its pose is no finite rigid transform and leaves a gap"
 _MOVED_ON_HEIGHTS = 1.5  # way of the camera after which depth is predicted again, camera heights
+# a frame that cannot be told apart from the one before is compared with an earlier one: least share of
+# its corners that are found again, and by how many sigmas the camera has moved
+_LEAST_SEEN, _MOVED_SIGMAS = 0.5, 3.0
 _LAST_ROADS = 8  # looked back for the camera's height, frames
 _MOST_UNREAD = 30  # unreadable images in a row: three seconds at 10 Hz, beyond which the motion cannot be guessed
 # frames between views for loops: a car goes some 4 m, still the same place to a descriptor
@@ -61,6 +64,10 @@ class FrameInWork:
     snippet: Future[SnippetPoses] | None
     depth: DepthMap | None = None
     height: float | None = None
+
+
+# a frame from which later ones cannot be told apart, ``T_frame_last``, and the steps to them by it
+Apart = tuple[FrameInWork, FloatArray, list[Motion]]
 
 
 @dataclass(frozen=True)
@@ -117,6 +124,7 @@ class Observer:
         self._features = FeatureExtractor(intrinsics)
         self._snippet_frames: tuple[Frame, ...] = ()
         self._recent: tuple[FrameInWork, ...] = ()
+        self._apart: Apart | None = None
         self._unread = 0  # frames in a row whose image cannot be read
         self._failed = 0  # and whose measurement failed
         self._depth_index = -1  # the last frame whose depth was asked for
@@ -288,7 +296,7 @@ class Observer:
             compute()
         except Exception as error:
             self._tasks.clear()
-            self._recent = ()
+            self._recent, self._apart = (), None
             reason = f"it could not be measured: {explained(error)}"
             self.drive.unusable[index] = reason
             if len(self.drive) == index:  # one entry in ``roads`` as all frames
@@ -320,11 +328,13 @@ class Observer:
         if rotation is not None:
             keep_rotation = self.drive.relative_rotations.append
             self._tasks.append(Task("geometry", self._beside.submit(rotation), keep_rotation))
-        if step is not None and previous is not None:
-            T_previous_current = step.relative_pose.T_from_to
-            images = previous.frame, current.frame
-            measured = self._beside.submit(self._road.measure, *images, T_previous_current)
-            self._tasks.append(Task("road", measured, partial(self._keep_road, step.ends)))
+        if step is not None:
+            first, motion = step
+            T_first_current = motion.relative_pose.T_from_to
+            measured = self._beside.submit(
+                self._road.measure, first, current.frame, T_first_current
+            )
+            self._tasks.append(Task("road", measured, partial(self._keep_road, motion.ends)))
         if current.prediction is not None:
             self._tasks.append(
                 Task("depth network", current.prediction, partial(self._learn, current))
@@ -367,15 +377,21 @@ class Observer:
         recent.height = None if isinstance(road, Failed) else road
         return recent.depth
 
-    def _step(self, previous: FrameInWork | None, current: FrameInWork) -> Motion | None:
-        """The motion from the frame before; None where keyframes measure it, it failed or triangulated no point."""
+    def _step(
+        self, previous: FrameInWork | None, current: FrameInWork
+    ) -> tuple[Frame, Motion] | None:
+        """The motion from an earlier frame, usually the one before, that triangulated points; None without one."""
         wanted = self._config.visual_odometry.enabled and not self.keyframes.measures(
             self.drive, current.frame.index
         )
+        apart, self._apart = self._apart, None
         if previous is None or not wanted:
             return None
-        depth = self._depth_of(previous)
-        measured = self._odometry.measure(previous.frame, current.frame, depth, previous.height)
+        first, measured = previous, self._motion(previous, current)
+        if isinstance(measured, Motion) and not measured.is_triangulated:
+            first, measured = self._told_apart(
+                apart or (previous, np.eye(4), []), previous.frame.index, current, measured
+            )
         if isinstance(measured, Motion) and not is_se3(measured.relative_pose.T_from_to):
             measured = Failed(_NO_POSE)
         if isinstance(measured, Failed):
@@ -388,7 +404,41 @@ class Observer:
             )
             return None
         self.drive.motions.append(measured)
-        return measured if measured.is_triangulated else None
+        return (first.frame, measured) if measured.is_triangulated else None
+
+    def _told_apart(
+        self, apart: Apart, previous: int, current: FrameInWork, step: Motion
+    ) -> tuple[FrameInWork, Motion]:
+        """The frame with which one is compared, and the motion to it.
+
+        From the frame ``previous`` there is a ``step`` without parallax. Where the camera has moved
+        since the last frame from which it can be told apart, what is known by that one replaces the
+        steps between.
+        """
+        first, T_first_previous, between = apart
+        wide = self._motion(first, current) if previous > first.frame.index else step
+        motions, since = self.drive.motions, current.frame.index - first.frame.index
+        if not isinstance(wide, Motion):
+            return first, step
+        if not wide.is_triangulated:
+            if wide.support < _LEAST_SEEN or since > LONGEST_STEP:
+                return first, step
+            pose = wide.relative_pose
+            T_previous_current = invert(T_first_previous) @ pose.T_from_to
+            by_first = replace(
+                pose, from_index=previous, T_from_to=T_previous_current, source=PNP_SOURCE
+            )
+            known = replace(wide, relative_pose=by_first)
+            if wide.length_unscaled < _MOVED_SIGMAS * np.linalg.norm(pose.sigmas[3:]):
+                self._apart = first, pose.T_from_to, [*between, known]
+                return first, step
+            self._apart, wide = (first, pose.T_from_to, []), known
+        motions[len(motions) - len(between) :] = between
+        return first, wide
+
+    def _motion(self, first: FrameInWork, last: FrameInWork) -> Motion | Failed:
+        depth = self._depth_of(first)
+        return self._odometry.measure(first.frame, last.frame, depth, first.height)
 
     def _relative_rotation(self, current: Frame) -> Callable[[], Any] | None:
         """Prepare to measure the rotation across the last steps, if all of them were triangulated."""

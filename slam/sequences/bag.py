@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.common.errors import DataError
+from erfsfm.common.errors import DataError, one_line
 from erfsfm.common.readers.camera_file import CameraFile, camera_of
 from erfsfm.common.readers.images import Stretch, decode_image, decode_values
 from slam.frames import Image
@@ -140,7 +140,7 @@ class Bag:
         except SequenceError:
             raise
         except Exception as error:  # of whatever kind a damaged file raises inside rosbags
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            reason = one_line(f"{type(error).__name__}: {error}")
             held = ", ".join(foreign_topics(self.path) if self.path.suffix == ".mcap" else [])
             if held:
                 cure = "convert it to a bag of ROS 2"

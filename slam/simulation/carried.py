@@ -271,7 +271,7 @@ class _Walk:
         longing[self._place] = np.inf
         goal = int(np.argmin(longing))
         path = floor.path(self._place, goal)
-        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+        length = se3.distance_along(path)
         along = np.linspace(0.0, length[-1], max(int(length[-1] / 0.02), 8))
         path = np.stack([np.interp(along, length, axis) for axis in path.T], axis=1)
         ahead = np.minimum(np.arange(len(path)) + 25, len(path) - 1)

@@ -355,7 +355,7 @@ def _corner(
 
 def _resample(path: FloatArray) -> FloatArray:
     """Points every ``STEP`` metres along a polyline."""
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    length = se3.distance_along(path)
     along = np.arange(0.0, length[-1], STEP)
     return np.stack([np.interp(along, length, path[:, i]) for i in range(path.shape[1])], axis=1)
 

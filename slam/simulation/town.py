@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from slam.geometry import se3
 from slam.simulation import objects
 from slam.simulation.geometry import Bend, FloatArray, Material, Mesh, Soup
 from slam.simulation.open_land import open_land
@@ -178,7 +179,7 @@ class _Town:
         inside = np.clip(edge, [inner[0], inner[1]], [inner[2], inner[3]])
         ring = np.pad(np.stack([edge, inside]), ((0, 0), (0, 0), (0, 1)), constant_values=KERB)
         self.soup.patch(ring, ring[..., :2], self.pavement)
-        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(edge, axis=0), axis=1))])
+        length = se3.distance_along(edge)
         step = ring[[0, 0]].copy()
         step[0, :, 2] = -0.1
         self.soup.patch(step, np.stack([np.stack([length] * 2), step[..., 2]], axis=2), self.kerb)

@@ -6,7 +6,7 @@ import logging
 import math
 import re
 import struct
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal
@@ -41,7 +41,10 @@ _JPEG_SEGMENT = re.compile(
     rb"\xff[^\x00\x01\xd0-\xd8\xff]", re.DOTALL
 )  # begins one with a length, or is the end
 _PNG_START, _PNG_END, _PNG_BIT_DEPTH = b"\x89PNG", b"IEND", 24
-_PNG_SIZE = struct.Struct(">II")  # width and height
+_PNG_SIZE, _PNG_SIZE_AT = struct.Struct(">II"), 16  # width and height
+# the segment that names height and width, after its length and the bits of a sample
+_JPEG_FRAME = re.compile(rb"\xff[\xc0-\xc3\xc5-\xc7\xc9-\xcb\xcd-\xcf]")
+_JPEG_SIZE, _JPEG_SIZE_AT = struct.Struct(">HH"), 3
 _ENDS_PERCENT = (0.1, 99.9)  # of the values: what is beyond is black or white
 _WIDE = 32768  # range of values from which on the upper eight bits show enough
 _STRETCHED_BY = 16  # images of a recording
@@ -194,8 +197,8 @@ def decode_values(data: bytes, where: str, flags: int = cv2.IMREAD_UNCHANGED) ->
     if not _is_complete(data):
         raise DataError(f"{where} is truncated at {len(data)} bytes: copy it again")
     too_many = DataError(f"{where} has more pixels than any camera: resize it, or leave it out")
-    # the header of a PNG is asked, for few kilobytes may unpack to gigabytes
-    if data.startswith(_PNG_START) and math.prod(_PNG_SIZE.unpack_from(data, 16)) > MOST_PIXELS:
+    # the header is asked, for few kilobytes may unpack to gigabytes
+    if _stored_pixels(data) > MOST_PIXELS:
         raise too_many
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -285,9 +288,26 @@ def _is_complete(data: bytes) -> bool:
     """
     if data.startswith(_PNG_START):
         return data.rfind(_PNG_END) > 0
+    is_jpeg = data.startswith(_JPEG_START)
+    return not is_jpeg or any(marker == _JPEG_END for marker, _ in _segments(data))
+
+
+def _stored_pixels(data: bytes) -> int:
+    """How many pixels the header of a PNG or JPEG file names, 0 of others."""
+    if data.startswith(_PNG_START):
+        return math.prod(_PNG_SIZE.unpack_from(data, _PNG_SIZE_AT))
+    if data.startswith(_JPEG_START):
+        for marker, place in _segments(data):
+            if _JPEG_FRAME.match(marker):
+                return math.prod(_JPEG_SIZE.unpack_from(data, place + _JPEG_SIZE_AT))
+    return 0
+
+
+def _segments(data: bytes) -> Iterator[tuple[bytes, int]]:
+    """The markers of a JPEG file up to its end, and where each segment begins."""
     place = len(_JPEG_START)
-    while data.startswith(_JPEG_START) and (found := _JPEG_SEGMENT.search(data, place)):
+    while found := _JPEG_SEGMENT.search(data, place):
+        yield found[0], found.end()
         if found[0] == _JPEG_END:
-            return True
+            return
         place = found.end() + int.from_bytes(data[found.end() : found.end() + 2], "big")
-    return not data.startswith(_JPEG_START)

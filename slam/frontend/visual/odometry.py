@@ -14,9 +14,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +23,6 @@ from slam.frames import (
     DepthMap,
     Ends,
     Frame,
-    Image,
     Intrinsics,
     RelativePose,
     nearest_depth,
@@ -77,7 +75,9 @@ _STILL_FLOW_PX = 0.3  # median optical flow below which the camera stands still,
 _NEAR_SLOPE = 0.05  # of a ray below the axis; the ground there is within 20 camera heights
 _LEAST_SHARED = 0.25  # of the near corners: what votes on them without those that passed by
 _MOST_STILL_FLOW_PX = 1.0  # of a corner of the world before a camera that stands still, pixels
-_MIN_PARALLAX_PX = 0.8  # least median optical flow that remains after rotation is removed, pixels
+# least median optical flow that remains after rotation is removed, pixels: from the frame before, and
+# from an earlier one, for which there is time until a sideways motion is told from a turn
+_LEAST_PARALLAX_PX = 0.8, 1.5
 _MIN_POINT_PARALLAX_PX = 2.0  # least parallax of a point used for step lengths, pixels
 _ROTATION_FLOOR_DEG = 0.002  # least rotation sigma, degrees
 # corners are measured in images of a megapixel at most: larger ones are no sharper, their pixels
@@ -112,7 +112,8 @@ class VisualOdometry:
         self._dynamic_mask = DynamicMask.empty(intrinsics.width, intrinsics.height)
         self._history = MotionHistory()
         self._last: Motion | None = None  # to the last frame, where one was measured
-        self._points: TriangulatedPoints | None = None  # by the last motion that corners alone gave
+        # by the last motion that corners alone gave, and the frame where it ended
+        self._points: tuple[int, TriangulatedPoints | None] = (-1, None)
         # tracks that fitted the last motion have the vote on the next one: what passes between the
         # camera and the world never did, however many corners it has
         self._fitted: NDArray[np.int64] = np.zeros(0, np.int64)
@@ -133,8 +134,8 @@ class VisualOdometry:
             height_unscaled: camera height in the same unit; where known, depths of more than
                 30 times as much are not trusted.
         """
-        previous, current = self._reduced(previous), self._reduced(current)
-        depth_previous_unscaled = self._reduced_depth(depth_previous_unscaled)
+        previous, current = previous.resized(*self._size), current.resized(*self._size)
+        depth_previous_unscaled = resized_depth(depth_previous_unscaled, *self._size)
         last, flow = self._last, None
         # by the constant-velocity model, if the last motion ended at the earlier frame and spans as
         # many frames
@@ -165,7 +166,7 @@ class VisualOdometry:
 
         None where nothing moved.
         """
-        depth = self._reduced_depth(depth_previous_unscaled)
+        depth = resized_depth(depth_previous_unscaled, *self._size)
         flow = PredictedFlow.of(motion.relative_pose.T_from_to, depth, self._intrinsics)
         return None if flow is None else flow.depth_current()
 
@@ -178,8 +179,8 @@ class VisualOdometry:
             A function that measures it from the present state, in any thread; its result is None
             with too few corners.
         """
-        first, last = self._reduced(first), self._reduced(last)
-        depth_first_unscaled = self._reduced_depth(depth_first_unscaled)
+        first, last = first.resized(*self._size), last.resized(*self._size)
+        depth_first_unscaled = resized_depth(depth_first_unscaled, *self._size)
         flow = PredictedFlow.of(T_first_last, depth_first_unscaled, self._intrinsics)
         if flow is None:
             return lambda: None
@@ -272,14 +273,14 @@ class VisualOdometry:
             tracks, votes, learned, height, self._dynamic_mask, self.depth_error
         )
         rays_previous, rays_current = matches.rays_previous[votes], matches.rays_current[votes]
+        ends = frames[0].index, frames[1].index
         # the translation of an essential matrix is arbitrary under pure rotation: only used with
         # enough parallax
         R_current_previous = rotation_between(rays_previous, rays_current)
         unexplained = parallax_px(rays_previous, rays_current, R_current_previous, self._focal)
-        if np.median(unexplained) < _MIN_PARALLAX_PX:
+        if np.median(unexplained) < _LEAST_PARALLAX_PX[ends[1] > ends[0] + 1]:
             return None
-        history = self._history
-        ends, seconds = (frames[0].index, frames[1].index), frames[1].stamp - frames[0].stamp
+        history, seconds = self._history, frames[1].stamp - frames[0].stamp
 
         def step(corners: Matches, before: MotionHistory) -> Step | None:
             two_view = estimate(corners, before, self._seed)
@@ -325,7 +326,8 @@ class VisualOdometry:
         self.focal_length = self.focal_length.with_step(
             *rays, two_view.unit_pose, self._intrinsics.fx
         )
-        self._points, self._fitted = step.points, tracks.track_ids[two_view.inliers]
+        self._points = step.motion.ends[1], step.points
+        self._fitted = tracks.track_ids[two_view.inliers]
 
     def _triangulated(
         self,
@@ -371,9 +373,8 @@ class VisualOdometry:
             depth_current[solid],
             relative_sigma[solid],
         )
-        last, earlier = self._last, self._points
-        is_next = last is not None and last.is_triangulated and last.ends[1] == ends[0]
-        ratio = triangulated.length_ratio(earlier) if is_next and earlier is not None else None
+        end, earlier = self._points
+        ratio = triangulated.length_ratio(earlier) if earlier and end == ends[0] else None
         relative = max(spread, _LEARNED_LENGTH_RELATIVE_SIGMA)
         sigmas = pose_sigmas(T_previous_current, np.sqrt(np.diag(covariance)), relative)
         pose = RelativePose(*ends, T_previous_current, sigmas, ESSENTIAL_SOURCE)
@@ -407,25 +408,6 @@ class VisualOdometry:
         sigmas = np.hypot(CORNER_CORRELATION * resection.sigmas, floors)
         pose = RelativePose(*ends, invert(resection.T_camera_world), sigmas, PNP_SOURCE)
         return Motion(pose, support=count / tracks.sought)
-
-    def _reduced(self, frame: Frame) -> Frame:
-        """The frame with an image of at most a megapixel."""
-
-        def reduced() -> Frame:
-            image: Image = np.asarray(
-                cv2.resize(frame.image, self._size, interpolation=cv2.INTER_AREA), np.uint8
-            )
-            return replace(frame, image=image)
-
-        return (
-            frame
-            if frame.image.shape[1::-1] == self._size
-            else frame.derived(("reduced", self._size), reduced)
-        )
-
-    def _reduced_depth(self, depth: DepthMap) -> DepthMap:
-        """The depth map ``(h, w)`` of the reduced image."""
-        return depth if depth.shape[::-1] == self._size else resized_depth(depth, *self._size)
 
 
 @dataclass(frozen=True)

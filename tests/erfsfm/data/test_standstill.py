@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from erfsfm.config import DataConfig
 from erfsfm.data.discovery import open_drive
@@ -46,8 +47,8 @@ def test_parts_of_parts_keep_their_numbers(tmp_path: Path, write_raw: WriteDrive
 
 def street(shift: int, traffic: int, gain: float, rng: np.random.Generator) -> np.ndarray:
     """A picture that the camera's motion shifts, with a car that passes, noise and an exposure."""
-    v, u = np.mgrid[:64, :208].astype(np.float64)
-    picture = 110 + 45 * np.sin((u + shift) / 9) * np.cos(v / 7)
+    grain = gaussian_filter(np.random.default_rng(0).normal(size=(64, 500)), 3.0)
+    picture = 110 + 45 / grain.std() * grain[:, shift : shift + 208]
     picture[20:50, traffic : traffic + 50] = 230
     noisy = gain + picture + rng.normal(0, 1, picture.shape)
     return np.repeat(np.clip(noisy, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
@@ -79,6 +80,17 @@ def test_by_images_where_there_is_no_speed(
         (drive / "image_02/data" / f"{broken:010d}.png").write_bytes(b"broken")
     recording, _ = open_drive(drive)
     assert recording.oxts is None and spans(recording) == kept
+
+
+def test_by_images_at_night(tmp_path: Path, write_raw: WriteDrive) -> None:
+    """A car that drives at night, under a plain sky, and stands from frame 3 to 6."""
+    drive = write_raw(tmp_path, speeds=None, frames=10, size=(64, 208))
+    rng = np.random.default_rng(1)
+    for index, shift in enumerate([0, 1, 2, 3, 3, 3, 3, 4, 5, 6]):
+        image = 0.2 * street(shift, 150, 0, rng)
+        image[:30] = 4
+        cv2.imwrite(str(drive / "image_02/data" / f"{index:010d}.png"), image)
+    assert spans(open_drive(drive)[0]) == [(0, 4), (7, 10)]
 
 
 @pytest.mark.data

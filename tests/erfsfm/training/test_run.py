@@ -32,6 +32,7 @@ from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.model_record import DepthInput, ModelRecord
+from erfsfm.networks.depth_net import DepthNet
 from erfsfm.training.module import SelfSupervision, learning_rate_factor
 from erfsfm.training.output_folder import licence_of
 from erfsfm.training.run import train
@@ -409,6 +410,36 @@ def test_a_non_finite_loss_stops_the_run(
     assert all(torch.isfinite(tensor).all() for tensor in weights_of(tmp_path / "run" / "last"))
     monkeypatch.undo()
     train(alone(), tmp_path / "run", resume=True, device="cpu")
+
+
+def test_a_training_that_ends_in_constant_depth_says_so(
+    alone: Configure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Far shorter than the hundred steps after which one is stopped."""
+    original = DepthNet.forward
+
+    def constant(disparities: list[Tensor] | Tensor) -> list[Tensor] | Tensor:
+        if isinstance(disparities, Tensor):
+            return 0.0 * disparities + 0.1
+        return [0.0 * each + 0.1 for each in disparities]
+
+    monkeypatch.setattr(DepthNet, "forward", lambda net, image: constant(original(net, image)))
+    with pytest.raises(TrainingError, match=r"one constant for 4 steps at step 4.*in last/"):
+        train(alone(), tmp_path / "run", device="cpu")
+    assert load_model(tmp_path / "run" / "last").record.step == 4
+
+
+def test_small_shared_memory_is_said_and_does_not_stop_a_training(
+    alone: Configure,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Data loaders that hand over batches by it would end, and the training wait for them for ever."""
+    free = SimpleNamespace(free=50_000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: free)
+    train(alone(data={"workers": 2}, training={"steps": 1}), tmp_path / "run", device="cpu")
+    assert "2 data loaders want 0.4" in caplog.text and "--shm-size" in caplog.text
 
 
 @pytest.mark.usefixtures("as_in_the_foreground")

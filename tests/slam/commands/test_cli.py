@@ -300,6 +300,11 @@ def test_evaluate_systems_against_one_reference(call: Call, make_run: MakeRun) -
     ):
         code, _, err = call("evaluate", *words, "--reference", truth)
         assert code == 1 and err.count("\n") == 1 and wanted in err
+    for folder in ("a", "b"):
+        shutil.copytree(run.path, f"{folder}/same")
+    words = "orb=orb_[01].txt", "a/same", "b/same", "--reference", truth, "--json"
+    systems = [each["system"] for each in json.loads(call("evaluate", *words)[1])]
+    assert systems == ["orb", "orb", "a/same", "b/same"]
     shutil.copy("orb_0.txt", "orb [1].txt")
     assert call("evaluate", "orb=orb [1].txt", "--reference", truth)[0] == 0
     code, _, err = call("evaluate", "/dev/urandom", "--reference", truth)
@@ -337,6 +342,9 @@ def test_localize_prints_a_row_an_image(call: Call, kitti_root: Path, tiny_weigh
     code, out, _ = call("localize", images / "000003.png", "--map", "run", "--json")
     assert code == 0 and [entry["image"] for entry in json.loads(out)] == ["000003.png"]
     assert call("localize", images, "--map", images)[0] == 1
+    cv2.imwrite("plain.png", np.full((64, 208, 3), 128, np.uint8))
+    code, out, _ = call("localize", "plain.png", "--map", "run")
+    assert code == 1 and "0 of 1 images found" in out
     reference = Path("run/reference.tum.txt").read_bytes()
     code, _, err = call("localize", images, "--map", "run", "--output", "run/reference.tum.txt")
     assert (

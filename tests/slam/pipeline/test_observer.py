@@ -7,6 +7,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +20,9 @@ from slam.frames import Frame
 from slam.frontend import tracking
 from slam.frontend.drive import Drive
 from slam.frontend.gaps import INTERPOLATED_SOURCE
+from slam.frontend.tracking import LONGEST_STEP
+from slam.frontend.visual.odometry import STILL_SOURCE
+from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.observer import Observer
@@ -26,7 +30,9 @@ from slam.pipeline.run import SlamPipeline, read_frame
 from slam.runtime.errors import Failed, MissingFrameError, SequenceError
 from slam.runtime.stopwatch import Stopwatch
 from slam.sequences.catalogue import SimulatedSequence
+from slam.simulation import street as street_world
 from slam.simulation.options import SimulationOptions
+from slam.simulation.route import Route, plan_route
 
 FRAMES = 40
 BAD = range(15, 25)
@@ -300,6 +306,46 @@ def assert_same(one: Observer, other: Observer) -> None:
     ]
     assert [view.index for view in first.views] == [view.index for view in second.views]
     assert first.unusable == second.unusable and first.failures == second.failures
+
+
+def test_a_camera_that_moves_too_little_to_be_told_from_the_frame_before_does_not_stand(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It is compared with the last frame from which it can be told apart."""
+
+    def crawling(*args: Any) -> Route:
+        """A frame every two centimetres, for half of the frames; it stands in the others."""
+        route = plan_route(*args)
+        step = np.minimum(np.arange(2 * FRAMES), FRAMES) * 0.02
+        T = route.T_street_camera[:1] @ se3.from_rotation_vector(
+            np.zeros((2 * FRAMES, 3)), step[:, None] * np.array([0.0, 0.0, 1.0])
+        )
+        return replace(route, T_street_camera=T)
+
+    monkeypatch.setattr(street_world, "plan_route", crawling)
+    sequence = SimulatedSequence(SimulationOptions("straight", 2 * FRAMES, 3, 416, 128))
+    render = functools.lru_cache(2 * FRAMES)(sequence.street.render)
+    monkeypatch.setattr(sequence.street, "render", render)
+    noise = OracleNoise(np.deg2rad(0.1), 0.03, seed=2)
+    predictor = OraclePredictor(
+        sequence.reference,
+        lambda k: np.where(render(k).depth > 0, render(k).depth, 200.0),
+        noise,
+        FACTOR,
+    )
+    config = config_with("mapping.enabled=false")
+    result = SlamPipeline(sequence, predictor, config).run()
+    errors = np.linalg.norm(
+        result.optimised.T_world_camera[:, :3, 3] - sequence.reference[:, :3, 3], axis=1
+    )
+    assert errors.max() < 0.03
+    still = {
+        motion.ends[1]
+        for motion in result.drive.motions
+        if motion.relative_pose.source == STILL_SOURCE
+    }
+    assert still.isdisjoint(range(FRAMES + 1))
+    assert still.issuperset(range(FRAMES + LONGEST_STEP + 1, 2 * FRAMES))
 
 
 def test_the_threads_of_an_observer_end_with_it() -> None:

@@ -93,7 +93,7 @@ def test_a_video_behind_a_photo_is_left_out(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("side", [9_000, 32_000])
 def test_more_pixels_than_can_be_are_not_taken_from_memory(tmp_path: Path, side: int) -> None:
-    """The header of a PNG announces them."""
+    """The header announces them."""
     _, content = cv2.imencode(".png", np.zeros((8, 8), np.uint8))
     header = b"IHDR" + struct.pack(">II", side, side) + content.tobytes()[24:29]
     (tmp_path / "a.png").write_bytes(
@@ -104,6 +104,12 @@ def test_more_pixels_than_can_be_are_not_taken_from_memory(tmp_path: Path, side:
     )
     with pytest.raises(DataError, match=r"a\.png has more pixels than any camera"):
         read_image(tmp_path / "a.png")
+    _, content = cv2.imencode(".jpg", np.zeros((8, 8), np.uint8))
+    size = content.tobytes().index(b"\xff\xc0") + 5
+    bomb = content.tobytes()[:size] + struct.pack(">HH", side, side) + content.tobytes()[size + 4 :]
+    (tmp_path / "b.jpg").write_bytes(bomb)
+    with pytest.raises(DataError, match=r"b\.jpg has more pixels than any camera"):
+        read_image(tmp_path / "b.jpg")
 
 
 def test_natural_order_ignores_other_files(tmp_path: Path) -> None:

@@ -136,15 +136,18 @@ class RoadHomography:
             return Failed("the image shows too little of the road")
         before, now = self._layers(previous), self._layers(current)
         plane = self._search(strip, before[0], now[0], T_unit, expected)
-        for layer_before, layer_now in zip(before, now, strict=True):
-            step, correlation = self._refine(
-                strip, layer_before, layer_now, T_unit, plane, expected
-            )
-            plane = step.plane
+        try:
+            for layer_before, layer_now in zip(before, now, strict=True):
+                step, correlation = self._refine(
+                    strip, layer_before, layer_now, T_unit, plane, expected
+                )
+                plane = step.plane
+        except np.linalg.LinAlgError:
+            return Failed("both images of the road are even")
         fine_before = strip.local(before[1][strip.rows, strip.columns, 0])
         fine_now = strip.local(now[1][strip.rows, strip.columns, 0])
         standing = _correlation(fine_before, fine_now)
-        length = float(np.linalg.norm(plane))
+        length = max(float(np.linalg.norm(plane)), 1e-9)
         deviation = float(np.arccos(np.clip(plane / length @ expected, -1.0, 1.0)))
         if not np.isfinite(length) or deviation > np.deg2rad(_MAX_TILT_DEG):
             return Failed(f"the road would be tilted by {np.rad2deg(deviation):.0f} deg")

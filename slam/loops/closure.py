@@ -33,6 +33,8 @@ _LEAST_GAP_FRAMES = 30  # least distance of the two frames of a loop, frames
 _TRIED_FIRST = 4  # candidates of a view of which one must be verified before the others are tried
 _SAME_PLACE = 0.05  # of the least path of a loop: 0.75 m
 _BLOCK = 256
+# loops nearby that agree, by which one corrects the unit between two parts of a map as far as it will
+_OVERRULING = 3
 Apart = Callable[[NDArray[np.intp]], NDArray[np.bool_]]
 _SUPPORT_SIGMAS = 3.0  # largest difference of supporting loops, sigmas
 # drift of the odometry between supporting loops over the path between them
@@ -297,27 +299,24 @@ def agreeing(
         track: odometry that they should agree with.
         thresholds: of the support that a loop needs, and of the drift it may correct.
     """
+    limit = f"{thresholds.max_drift_ratio:.0%}"
+    too_far = f"corrects the odometry by more than {limit} of the path between its frames"
     possible: list[Loop] = []
+    doubtful: list[bool] = []
     kept: list[Loop] = []
     refused: list[RejectedLoop] = []
     for loop, (earlier, later) in zip(loops, track.rows(loops), strict=True):
         T_earlier_later = invert(track.T_world_camera[earlier]) @ track.T_world_camera[later]
         drift = np.linalg.norm((T_earlier_later - loop.measured.T_from_to)[:3, 3])
         length = track.path[later] - track.path[earlier]
-        if (
-            track.worlds[earlier] == track.worlds[later]
-            and drift > thresholds.max_drift_ratio * length
-        ):
-            limit = f"{thresholds.max_drift_ratio:.0%}"
-            refused.append(
-                loop.refused(
-                    f"corrects the odometry by more than {limit} of the path between its frames"
-                )
-            )
+        is_far = bool(drift > thresholds.max_drift_ratio * length)
+        if is_far and track.maps[earlier] == track.maps[later]:
+            refused.append(loop.refused(too_far))
         else:
             possible.append(loop)
-    for loop, (supporting, conflicting) in zip(
-        possible, _votes_by_maps(possible, track, thresholds), strict=True
+            doubtful.append(is_far and track.worlds[earlier] == track.worlds[later])
+    for loop, is_doubtful, (supporting, conflicting) in zip(
+        possible, doubtful, _votes_by_maps(possible, track, thresholds), strict=True
     ):
         if conflicting > supporting:
             refused.append(
@@ -325,6 +324,8 @@ def agreeing(
                     f"contradicted by {conflicting} of {conflicting + supporting} loops nearby"
                 )
             )
+        elif is_doubtful and supporting < _OVERRULING:
+            refused.append(loop.refused(too_far))
         elif supporting < thresholds.min_support and loop.inliers < thresholds.alone_inliers:
             refused.append(loop.refused(f"lacks support: {supporting} loops nearby agree"))
         else:

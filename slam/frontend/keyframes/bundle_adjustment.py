@@ -22,7 +22,7 @@ from slam.geometry.multiview import LEAST_DEPTH, PIXEL_SIGMA, pixel_jacobian
 from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray, apply, compose, from_rotation_vector
 
-_HUBER = 1.5  # sigmas beyond which residuals weigh less
+_ROBUST = 1.5  # sigmas beyond which residuals weigh less
 _FIRST_DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6
 # points whose sightings are eliminated together: they share few cameras
@@ -75,7 +75,7 @@ class BundleAdjustment:
         intrinsics: Intrinsics,
         free: NDArray[np.bool_],
         pixel_sigma: float = PIXEL_SIGMA,
-        huber: float = _HUBER,
+        robust: float = _ROBUST,
     ) -> None:
         """Prepare to adjust cameras and points.
 
@@ -84,9 +84,9 @@ class BundleAdjustment:
             intrinsics: of all cameras.
             free: cameras that are adjusted ``(K,)``; the others stay.
             pixel_sigma: of a sighting, pixels.
-            huber: sigmas beyond which residuals weigh less.
+            robust: sigmas beyond which residuals weigh less.
         """
-        self._seen, self._pixel_sigma, self._huber = sightings, pixel_sigma, huber
+        self._seen, self._pixel_sigma, self._robust = sightings, pixel_sigma, robust
         self._focal = np.array([intrinsics.fx, intrinsics.fy])
         self._rays = intrinsics.rays(sightings.pixels)[:, :2]
         self._log_depth = np.log(sightings.depth)
@@ -180,7 +180,7 @@ class BundleAdjustment:
             np.arange(len(self._learned_rows)), [len(each) for each in self._learned_rows]
         )
         own, sigma = logarithms[rows], self._depth_sigma[rows]
-        near, full = self._huber * sigma, sigma**-2
+        near, full = self._robust * sigma, sigma**-2
         unit = np.array([median(logarithms[each]) for each in self._learned_rows])
         for _ in range(_ROUNDS):
             weight = full * np.minimum(1.0, near / np.maximum(np.abs(own - unit[image]), 1e-9))
@@ -209,19 +209,20 @@ class BundleAdjustment:
         return X
 
     def _cost(self, residuals: FloatArray) -> float:
-        """Huber's."""
-        length, k = self._lengths(residuals), self._huber
-        return float(np.where(length < k, 0.5 * length**2, k * (length - 0.5 * k)).sum())
+        """Cauchy's of pixels, for corners in reflections agree on a motion of their own, and Huber's of depth."""
+        (pixel, depth), k = self._lengths(residuals).T, self._robust
+        by_depth = np.where(depth < k, 0.5 * depth**2, k * (depth - 0.5 * k))
+        return float((0.5 * k**2 * np.log1p((pixel / k) ** 2) + by_depth).sum())
 
     def _lengths(self, residuals: FloatArray) -> FloatArray:
         """Of the residual of the pixel, and of that of depth ``(S, 2)``."""
         return np.stack([np.linalg.norm(residuals[:, :2], axis=1), np.abs(residuals[:, 2])], axis=1)
 
     def weights(self, residuals: FloatArray) -> FloatArray:
-        """Square roots of Huber's weights ``(S, 3)``."""
-        length = self._lengths(residuals)
-        root = np.sqrt(np.minimum(self._huber / np.maximum(length, 1e-12), 1.0))
-        return np.asarray(root[:, [0, 0, 1]])
+        """Square roots of the weights of the residuals ``(S, 3)``."""
+        pixel, depth = self._lengths(residuals).T / self._robust
+        by_pixel, by_depth = 1.0 / np.hypot(1.0, pixel), np.maximum(depth, 1.0) ** -0.5
+        return np.stack([by_pixel, by_pixel, by_depth], axis=1)
 
     def _normal_equations(
         self, T: FloatArray, X: FloatArray, residuals: FloatArray

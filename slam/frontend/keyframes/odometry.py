@@ -59,6 +59,8 @@ _LAST_FRAMES = 4  # frames in which a pose is looked up
 _PARALLAX_RATIO = 0.03
 _YOUNG_PARALLAX_RATIO = 0.0125
 _YOUNG_KEYFRAMES = 4
+# from which on a first motion is doubted: a reversed one takes most of the flow for a turn
+_DOUBTFUL_PARALLAX_RATIO = 0.005
 _LOOKED_BACK = 4  # keyframes between which points have parallax before a first motion
 _MAX_CORNERS = 500  # of a keyframe
 _NOTHING: tuple[TrackIds, Pixels] = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
@@ -246,7 +248,7 @@ class KeyframeOdometry:
         limit = _YOUNG_PARALLAX_RATIO if is_young else _PARALLAX_RATIO
         are_few = len(track_ids) < max(_KEYFRAME_TRACKS_RATIO * len(last.track_ids), MIN_POINTS)
         if are_few or parallax > limit or flow > _MOST_FLOW * limit:
-            if parallax > _YOUNG_PARALLAX_RATIO:
+            if parallax > _DOUBTFUL_PARALLAX_RATIO:
                 self._check_first_motion(segment, track_ids, pixels)
             self._add_keyframe(segment, frame, track_ids, places)
         segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, self._T_camera_world))

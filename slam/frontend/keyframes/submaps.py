@@ -39,8 +39,8 @@ _INDEPENDENT = 10
 # sigmas of the logarithm of the unit
 _BEGUN = 0.03  # to the keyframe from which on points have parallax
 _CARRIED = 0.05  # between two keyframes of one part
-_TURNED = 0.05  # the most by points without parallax
-_UNKNOWN = 0.5  # where keyframes share few points
+_TURNED = 0.05  # the most by points without parallax, before points have any
+_UNKNOWN = 2.0  # the most, and where keyframes share few points: learned depth alone says it
 # of the sigma of one carry, that adds up along a map: what one keyframe lacks, the next ones see
 _DRIFT = 0.2
 _LEAST_KEYFRAMES = 4  # of a part
@@ -72,8 +72,10 @@ def parts_of(segment: LocalMap, intrinsics: Intrinsics) -> list[LocalMap]:
     tied = np.array(shared) >= MIN_POINTS
     sigmas = _sigmas(segment, intrinsics)
     along = np.minimum(sigmas, _TURNED) * np.where(sigmas < _CARRIED, _DRIFT, 1.0)
-    held = _held(segment, np.where(tied, along, _UNKNOWN))
-    part_of, parts = _cut(held, tied & _carries(sigmas))
+    carried = tied & _carries(sigmas)
+    over_cuts = np.where(tied, sigmas, np.inf).clip(max=_UNKNOWN)
+    held = _held(segment, np.where(carried, along, over_cuts))
+    part_of, parts = _cut(held, carried)
     if not parts:
         return [held]
     _add_turns(parts, part_of, held.keyframes, tied)

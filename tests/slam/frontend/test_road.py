@@ -135,6 +135,10 @@ def test_what_is_no_road_is_refused_with_a_reason(texture, monkeypatch):
     noise = [Frame(k, 0.0, rng.integers(0, 255, (188, 620, 3), np.uint8)) for k in range(2)]
     failure = RoadHomography(CAMERA).measure(*noise, step)
     assert isinstance(failure, Failed) and "do not correlate" in failure.reason
+    even = [Frame(k, 0.0, np.full((188, 620, 3), 120, np.uint8)) for k in range(2)]
+    for pitch in np.linspace(0.0, 1.0, 21):  # some of them leave a singular system
+        tilted = se3.make(np.eye(3), np.array([0.0, np.sin(pitch), np.cos(pitch)]))
+        assert isinstance(RoadHomography(CAMERA).measure(*even, tilted), Failed)
     sky = Intrinsics(620, 188, 360.0, 360.0, 303.0, 180.0)
     failure = RoadHomography(sky).measure(*noise, step)
     assert isinstance(failure, Failed) and "too little of the road" in failure.reason

@@ -215,6 +215,19 @@ def test_a_loop_between_maps_may_not_contradict_the_motion_between_them() -> Non
     assert len(agreeing(far, replace(track, maps=maps, worlds=maps), OF_FRAMES)[0]) == 1
 
 
+def test_loops_over_a_doubtful_step_agree_on_another_unit() -> None:
+    """The second of two maps that odometry relates has lengths three times too long: one loop alone may not say so."""
+    track = Track.of_drive(ring())
+    maps = (track.frames >= 150).astype(np.intp)
+    steps = invert(ring()[:-1]) @ ring()[1:]
+    steps[150:, :3, 3] *= 3.0
+    jumped = replace(track, T_world_camera=chain(steps), maps=maps)
+    true = [replace(loop(k, 200 + k, ring()), scale=1 / 3) for k in range(0, 40, 4)]
+    assert agreeing(true, jumped, OF_FRAMES)[0] == true
+    alone = [replace(true[0], inliers=300)]
+    assert "corrects the odometry" in agreeing(alone, jumped, OF_FRAMES)[1][0].reason
+
+
 def place(rng: np.random.Generator) -> np.ndarray:
     return rng.integers(0, 256, (80, 32), dtype=np.uint8)
 

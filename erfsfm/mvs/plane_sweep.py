@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from erfsfm.mvs.views import Array, Projection
 
-WINDOW_PX = 5
+WINDOW_PX = 7
 # changes of the logarithm of inverse depth, denser near the guess; negative is farther
 CHANGES: Array = np.array(
     [-2.4, -1.6, -1.0, -0.7, *(np.arange(-5, 7) / 10), 0.8, 1.0, 1.25], dtype=np.float32

@@ -183,6 +183,9 @@ def evaluate_depth(
         Path | None,
         typer.Option(help="with many-views: folder that keeps poses and depth for the next time"),
     ] = None,
+    refined: Annotated[
+        bool, typer.Option("--refined", help="depth as a run makes it, in its metres: all frames")
+    ] = False,
     split: Annotated[
         str | None,
         typer.Option(
@@ -213,7 +216,11 @@ def evaluate_depth(
     Example: erfsfm evaluate depth --weights default --weights sim --dataset worlds --dataset KITTI_RAW --output d.json
     """
     from erfsfm.data.discovery import named_recordings
-    from erfsfm.evaluation.depth_protocols import depth_protocol, many_view_protocol
+    from erfsfm.evaluation.depth_protocols import (
+        depth_protocol,
+        many_view_protocol,
+        refined_protocol,
+    )
     from erfsfm.evaluation.eigen import eigen_protocol
     from erfsfm.inference import DepthPosePredictor
 
@@ -225,6 +232,8 @@ def evaluate_depth(
         raise ConfigError("--sequence and --cache belong to --truth many-views")
     if fidelity == "paper" and split is None:
         raise ConfigError("--fidelity paper needs --split eigen or a file of frames of KITTI raw")
+    if refined and (truth == "many-views" or split or pictures or len(weights) > 1):
+        raise ConfigError("--refined takes one --weights and true depth: leave other options out")
     if (max(len(dataset), len(weights)) > 1 or pictures) and (
         truth == "many-views" or split is not None
     ):
@@ -241,6 +250,8 @@ def evaluate_depth(
                 part for name in sequence or [""] for part in named_recordings(dataset[0], name)
             ]
             rows = many_view_protocol(networks["networks"], parts, cache, allow_leak, show)
+        elif refined:
+            rows = refined_protocol(networks["networks"], weights[0], dataset, allow_leak, show)
         elif split is None:
             rows = depth_protocol(networks, dataset, allow_leak, show, pictures)
         else:
@@ -259,6 +270,9 @@ def _show(rows: list[dict[str, Any]], output: Path | None, as_json: bool) -> Non
 
 def _narrow(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """What of streets' rows fits into a table of 80 columns; other rows as they are."""
+    if "refined_se" in rows[0]:
+        keys = ("street", "learned", "refined", "refined_se", "median", "in_90", "frames")
+        return [{key: row[key] for key in keys if key in row} for row in rows]
     if "abs_rel_se" not in rows[0]:
         return rows
     compares = any("ratio" in row for row in rows)

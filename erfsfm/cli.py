@@ -142,6 +142,9 @@ def train_fusion(
         int, typer.Option(min=8, help="to draw; a thousand takes 0.7 GB of memory")
     ] = 4000,
     steps: Annotated[int, typer.Option(min=1, help="of optimisation")] = 6000,
+    start: Annotated[
+        str | None, typer.Option(help="begin with the network of default, or an output folder")
+    ] = None,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -151,10 +154,9 @@ def train_fusion(
     """
     from erfsfm.training.fusion import train_fusion as run_training
 
+    told = samples, steps, seed, _command()
     with progress_bar() as progress:
-        metrics = run_training(
-            dataset, validation, output, weights, samples, steps, seed, _command(), progress
-        )
+        metrics = run_training(dataset, validation, output, weights, *told, progress, start)
     print_rows([metrics], as_json)
     if not as_json:
         typer.echo(f"network in {output}: use it with --set depth.fusion={output}")

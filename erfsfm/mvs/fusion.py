@@ -45,7 +45,7 @@ class DepthFusion:
     """
 
     def __init__(self, name: str) -> None:
-        path = (SHIPPED if name == "default" else Path(name)) / FILE
+        self.path = path = (SHIPPED if name == "default" else Path(name)) / FILE
         try:
             self._session: InferenceSession = open_session(read_bytes(path, _MOST_BYTES), _THREADS)
         except OSError as error:

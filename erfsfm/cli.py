@@ -142,6 +142,9 @@ def train_fusion(
         int, typer.Option(min=8, help="to draw; a thousand takes 0.7 GB of memory")
     ] = 4000,
     steps: Annotated[int, typer.Option(min=1, help="of optimisation")] = 6000,
+    start: Annotated[
+        str | None, typer.Option(help="begin with the network of default, or an output folder")
+    ] = None,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -151,10 +154,9 @@ def train_fusion(
     """
     from erfsfm.training.fusion import train_fusion as run_training
 
+    told = samples, steps, seed, _command()
     with progress_bar() as progress:
-        metrics = run_training(
-            dataset, validation, output, weights, samples, steps, seed, _command(), progress
-        )
+        metrics = run_training(dataset, validation, output, weights, *told, progress, start)
     print_rows([metrics], as_json)
     if not as_json:
         typer.echo(f"network in {output}: use it with --set depth.fusion={output}")
@@ -183,6 +185,9 @@ def evaluate_depth(
         Path | None,
         typer.Option(help="with many-views: folder that keeps poses and depth for the next time"),
     ] = None,
+    refined: Annotated[
+        bool, typer.Option("--refined", help="depth as a run makes it, in its metres: all frames")
+    ] = False,
     split: Annotated[
         str | None,
         typer.Option(
@@ -213,7 +218,11 @@ def evaluate_depth(
     Example: erfsfm evaluate depth --weights default --weights sim --dataset worlds --dataset KITTI_RAW --output d.json
     """
     from erfsfm.data.discovery import named_recordings
-    from erfsfm.evaluation.depth_protocols import depth_protocol, many_view_protocol
+    from erfsfm.evaluation.depth_protocols import (
+        depth_protocol,
+        many_view_protocol,
+        refined_protocol,
+    )
     from erfsfm.evaluation.eigen import eigen_protocol
     from erfsfm.inference import DepthPosePredictor
 
@@ -225,6 +234,8 @@ def evaluate_depth(
         raise ConfigError("--sequence and --cache belong to --truth many-views")
     if fidelity == "paper" and split is None:
         raise ConfigError("--fidelity paper needs --split eigen or a file of frames of KITTI raw")
+    if refined and (truth == "many-views" or split or pictures or len(weights) > 1):
+        raise ConfigError("--refined takes one --weights and true depth: leave other options out")
     if (max(len(dataset), len(weights)) > 1 or pictures) and (
         truth == "many-views" or split is not None
     ):
@@ -241,6 +252,8 @@ def evaluate_depth(
                 part for name in sequence or [""] for part in named_recordings(dataset[0], name)
             ]
             rows = many_view_protocol(networks["networks"], parts, cache, allow_leak, show)
+        elif refined:
+            rows = refined_protocol(networks["networks"], weights[0], dataset, allow_leak, show)
         elif split is None:
             rows = depth_protocol(networks, dataset, allow_leak, show, pictures)
         else:
@@ -259,6 +272,9 @@ def _show(rows: list[dict[str, Any]], output: Path | None, as_json: bool) -> Non
 
 def _narrow(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """What of streets' rows fits into a table of 80 columns; other rows as they are."""
+    if "refined_se" in rows[0]:
+        keys = ("street", "learned", "refined", "refined_se", "median", "in_90", "frames")
+        return [{key: row[key] for key in keys if key in row} for row in rows]
     if "abs_rel_se" not in rows[0]:
         return rows
     compares = any("ratio" in row for row in rows)

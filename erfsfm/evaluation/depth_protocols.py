@@ -6,6 +6,8 @@ surfaces are measured from neighbouring frames at a run's poses.
 
 from __future__ import annotations
 
+import json
+import logging
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
@@ -19,6 +21,7 @@ from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
 from erfsfm.common.files import write_atomically
+from erfsfm.common.processes import slam_process
 from erfsfm.common.progress import Progress, silent
 from erfsfm.data.many_view_teacher import LARGEST_WIDTH, ManyViewTeacher
 from erfsfm.data.recordings import Recording
@@ -33,6 +36,8 @@ from erfsfm.evaluation.depth_metrics import (
 from erfsfm.evaluation.streets import EVERY, Street, find_streets
 from erfsfm.inference import DepthPosePredictor, refuse_leak
 
+logger = logging.getLogger(__name__)
+
 _BASELINE = "median depth map"
 _PICTURE_WIDTH = 620
 
@@ -40,6 +45,11 @@ CAP_HEIGHTS = 50.0  # camera heights: some 80 m from a car's roof
 LARGEST_RATIO = 1.3  # of the bounds of a pixel's depth; wider ones are no truth
 SLAM_WEIGHTS = "default"
 TRUTH_FOLDER = "truth"
+_RUN = (
+    "loops.enabled=false",
+    "mapping.keyframe_distance_m=0.3",
+    "output.report=false",
+)  # all frames
 _RATIOS = ("abs_rel", "rmse_log", "a1", "a2", "a3")  # errors without a unit: the scale is fitted
 
 
@@ -104,6 +114,76 @@ def depth_protocol(
                 f"no depth between 0 and {CAP_M:g} m in {street.name}: nothing to compare with"
             )
     return _depth_rows(networks, streets, errors, leaks)
+
+
+def refined_protocol(
+    networks: DepthPosePredictor,
+    weights: str,
+    roots: Sequence[Path],
+    allow_leak: bool,
+    progress: Progress = silent,
+) -> list[dict[str, Any]]:
+    """Errors in metres under 80 m of the depth that a run gives its keyframes, learned and refined; nothing is scaled.
+
+    A street that a run cannot measure, as one of fewer than five images in a row, is left out with a warning.
+
+    Args:
+        networks: whose leak record is read.
+        weights: their name, for the runs.
+        roots: with true depth, as those of `depth_protocol`.
+        allow_leak: evaluate also streets that the networks were trained on.
+        progress: told of the stage, what is done, and of how many.
+
+    Returns:
+        The mean over streets, with the standard error of ``refined``, and a row for each street. ``learned`` and
+        ``refined`` are mean relative errors, the latter also ``by_range``; ``median`` is that of refined depth and
+        ``in_90`` the share of its errors inside the 90 % bound. Where masks tell what moves, rows follow for what
+        stands and what moves.
+
+    Raises:
+        DataError: no true depth under a root, no street that a run can measure, or a leak that was not allowed.
+    """
+    streets = [street for root in roots for street in find_streets(root)]
+    seen = list(chain.from_iterable(street.seen for street in streets))
+    leak = refuse_leak(networks, seen, allow_leak)
+    whole: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = []
+    for done, street in enumerate(streets):
+        progress("runs", done, len(streets))
+        for part in street.parts:
+            name = f"{street.name} {part}".strip()
+            depth = _depth_of_run(street, part, weights)
+            if isinstance(depth, str):
+                logger.warning("%s is left out: %s", name, depth)
+                break
+            refined = depth["refined"]
+            row = {"street": name, "learned": depth["network"]["abs_rel"]}
+            row |= {"refined": refined["abs_rel"], "median": refined["median_rel"]}
+            row |= {"in_90": refined["coverage"]["90"], "frames": refined["frames"]}
+            rows.append(row | {"by_range": refined["by_range"]})
+            if not part:
+                whole.append(row)
+    if not whole:
+        raise DataError("a run can measure no street: give at least five images in a row")
+    mean: dict[str, Any] = {"street": "mean", "refined_se": None}
+    for key in ("learned", "refined", "median", "in_90"):
+        mean[key] = float(np.mean([row[key] for row in whole]))
+    mean["refined_se"] = standard_error([row["refined"] for row in whole])
+    return [mean | {"streets": len(whole), "leak": leak}, *rows]
+
+
+def _depth_of_run(street: Street, part: str, weights: str) -> dict[str, Any] | str:
+    """``depth`` of ``metrics.json`` of a run against a part of the truth, or why there is none."""
+    with tempfile.TemporaryDirectory(prefix="erfsfm-refined-") as temporary:
+        output = Path(temporary) / "run"
+        words = [*street.drive(Path(temporary), part), "--output", str(output)]
+        for setting in _RUN:
+            words += ["--set", setting]
+        reason = slam_process(["run", "--weights", weights, *words])
+        if reason:
+            return reason
+        depth: dict[str, Any] = json.loads((output / "metrics.json").read_text())["depth"]
+    return depth if depth["refined"] else str(depth["refined_reason"])
 
 
 def _depth_rows(

@@ -10,10 +10,12 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
+from erfsfm.common.files import read_text
 from erfsfm.common.readers.images import list_images, read_depth_map, read_image
 from erfsfm.common.readers.kitti import find_drives
 from erfsfm.data.discovery import discover
@@ -24,6 +26,9 @@ from erfsfm.evaluation.eigen import RawFrame, lidar_depth
 EVERY = 5  # frames of a recording or drive, of which one is compared
 IMAGES = "images"
 TRUTH = "truth"
+MOVING = "moving"  # masks of the same names as the truth, not 0 where something moves
+CAMERAS = "calib"  # a text a pair: fx fy cx cy of its image, pixels
+PARTS = "static", "moving"
 
 Image = NDArray[np.uint8]
 Depth = NDArray[np.float32]
@@ -38,6 +43,9 @@ class Street:
         seen: names with frames, for the leak record.
         frames: each gives an image ``(H, W, 3)`` and its true z-depth in metres ``(H, W)``, 0 where unknown.
         crop: part of the image that is compared.
+        drive: words of a run of the SLAM system on all its frames; those of pairs are laid out in a new folder first,
+            with the truth of one of the ``parts``.
+        parts: of the truth: all of it, and where masks tell what moves, what stands and what moves.
         typical: a depth map that uses no image ``(H, W)``; None for LiDAR, whose points are few.
     """
 
@@ -45,6 +53,8 @@ class Street:
     seen: list[str]
     frames: list[Callable[[], tuple[Image, Depth]]]
     crop: Crop
+    drive: Callable[[Path, str], list[str]]
+    parts: tuple[str, ...] = ("",)
     typical: Depth | None = None
 
 
@@ -75,9 +85,37 @@ def _of_pairs(root: Path) -> list[Street]:
         if truth.is_file():
             before = image.stem.rpartition("_")[0]
             name = f"folder/{root.resolve().name}" + (f"/{before}" if before else "")
-            street = streets.setdefault(name, Street(name, [name], [], "garg"))
+            parts = ("", *PARTS) if (root / MOVING / truth.name).is_file() else ("",)
+            new = Street(name, [name], [], "garg", partial(_laid_out, root, before), parts)
+            street = streets.setdefault(name, new)
             street.frames.append(partial(_pair, image, truth))
     return [*streets.values()]
+
+
+def _laid_out(root: Path, street: str, folder: Path, part: str) -> list[str]:
+    """Pairs of a street as a sequence of KITTI's odometry, with the truth of a part."""
+    sequence = folder / "sequences" / "00"
+    for name in ("image_2", "depth_2"):
+        (sequence / name).mkdir(parents=True)
+    camera = np.zeros(6)
+    for image in list_images(root / IMAGES):
+        before, _, number = image.stem.rpartition("_")
+        truth, moving = (root / each / f"{image.stem}.png" for each in (TRUTH, MOVING))
+        if before != street or not truth.is_file():
+            continue
+        (sequence / "image_2" / f"{number}{image.suffix}").symlink_to(image.resolve())
+        depth = cv2.imread(str(truth), cv2.IMREAD_UNCHANGED)
+        if part:
+            depth[(cv2.imread(str(moving), cv2.IMREAD_GRAYSCALE) > 0) != (part == PARTS[1])] = 0
+        cv2.imwrite(str(sequence / "depth_2" / f"{number}.png"), depth)
+        camera = np.array(read_text(root / CAMERAS / f"{image.stem}.txt").split(), float)
+    fx, fy, cx, cy = camera[:4]
+    (sequence / "calib.txt").write_text(f"P2: {fx} 0 {cx} 0 0 {fy} {cy} 0 0 0 1 0\n")
+    return ["--dataset", str(folder)]
+
+
+def _on_its_own(root: Path, sequence: str, folder: Path, part: str) -> list[str]:
+    return ["--dataset", str(root), "--sequence", sequence]
 
 
 def _pair(image_file: Path, truth_file: Path) -> tuple[Image, Depth]:
@@ -99,11 +137,11 @@ def _of_drives(root: Path) -> list[Street]:
         frames = [RawFrame(base, drive, index) for index in scans[::EVERY]]
         if frames:
             seen = [frame.name for frame in frames]
-            streets.append(
-                Street(
-                    f"kitti_raw/{drive}", seen, [partial(_scan, frame) for frame in frames], "garg"
-                )
+            street = Street(
+                f"kitti_raw/{drive}", seen, [], "garg", partial(_on_its_own, root, drive)
             )
+            street.frames.extend(partial(_scan, frame) for frame in frames)
+            streets.append(street)
     return streets
 
 
@@ -128,7 +166,9 @@ def _of_recordings(root: Path) -> list[Street]:
     streets: dict[str, Street] = {}
     typical = _median_map(truths) if truths else None
     for recording in recordings:
-        street = streets.setdefault(recording.name, Street(recording.name, [], [], "none", typical))
+        on_its_own = partial(_on_its_own, root, recording.sequence)
+        new = Street(recording.name, [], [], "none", on_its_own, typical=typical)
+        street = streets.setdefault(recording.name, new)
         street.seen.append(recording.frames_name)
     for recording, index in frames:
         streets[recording.name].frames.append(partial(_frame, recording, index))

@@ -45,7 +45,7 @@ class DepthFusion:
     """
 
     def __init__(self, name: str) -> None:
-        path = (SHIPPED if name == "default" else Path(name)) / FILE
+        self.path = path = (SHIPPED if name == "default" else Path(name)) / FILE
         try:
             self._session: InferenceSession = open_session(read_bytes(path, _MOST_BYTES), _THREADS)
         except OSError as error:
@@ -98,7 +98,10 @@ def evidence(measurement: Measurement) -> Array:
         np.log(np.maximum(measurement.information, _LEAST_INFORMATION)) / 4,
         y * np.exp(-nearness - measurement.change),  # height under the camera over the median depth
     )
-    half = _of_costs(measurement.costs, measurement.coarse)
+    every_second = slice(0, 2 * h, 2), slice(0, 2 * w, 2)
+    half = _of_costs(
+        np.ascontiguousarray(measurement.costs[:, *every_second]), measurement.coarse[every_second]
+    )
     return np.concatenate(
         [np.clip([_quartered(part, h, w) for part in full], -_MOST, _MOST).reshape(-1, h, w), half]
     )

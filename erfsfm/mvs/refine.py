@@ -1,7 +1,7 @@
 """Learned depth as a prior, neighbouring images at known poses as the measurement.
 
-A plane sweep around the prior at half size finds each pixel's change of depth. The change is brought to
-full size along the edges of the image and sharpened by Gauss-Newton steps on all neighbours at once.
+A plane sweep around the prior finds each pixel's change of depth, which a Gauss-Newton step on all neighbours at once
+sharpens.
 """
 
 from __future__ import annotations
@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.mvs.plane_sweep import WINDOW_PX, Costs, is_inside, lowest, smoothed, sweep, warped
-from erfsfm.mvs.views import Appearance, Array, Projection, halved
+from erfsfm.mvs.views import Appearance, Array, Projection
 
-STEPS = 2
 RESIDUAL = 0.5  # of normalised grey levels, beyond which a pixel loses weight
 RESIDUAL_FLOOR = 0.02  # least variance of the residuals
-SWEEP_SIGMA = 0.06  # of log inverse depth, before the Gauss-Newton steps
+SWEEP_SIGMA = 0.06  # of log inverse depth, before the Gauss-Newton step
 LARGEST_STEP = 0.08
 INDEPENDENT_PIXELS = 3.0  # of a window: residuals of neighbouring pixels are correlated
 SIGMA_FLOOR = 0.03
@@ -42,7 +41,7 @@ class Measurement:
 
     Of the ``target``, its learned z-depth ``(H, W)`` and its camera matrix ``(3, 3)``: the ``change`` of log inverse
     depth ``(H, W)``, the ``information`` on it, and the ``fit``, the neighbours' mean weight; ``costs`` of the plane
-    sweep ``(C, h, w)`` at half size, and the ``coarse`` change ``(h, w)`` by smoothed ones.
+    sweep ``(C, H, W)``, and the ``coarse`` change ``(H, W)`` by smoothed ones.
     """
 
     target: Appearance
@@ -79,44 +78,15 @@ def measure(
         K: camera matrix ``(3, 3)`` of these images.
         T_neighbour_target: ``(N, 4, 4)``; the unit of its translations is that of the depth.
     """
-    (height, width), (h, w) = depth.shape, target.coarse.shape
     inverse = (1 / depth).astype(np.float32)
-    small = np.asarray(cv2.resize(inverse, (w, h), interpolation=cv2.INTER_AREA), np.float32)
     views: list[tuple[Appearance, Projection]] = []
-    small_views: list[tuple[Array, Projection]] = []
     for other, T in zip(neighbours, T_neighbour_target):
-        views.append((other, Projection(K, T, height, width)))
-        small_views.append((other.coarse, Projection(halved(K), T, h, w)))
-    costs = sweep(target.coarse, small_views, small)
-    coarse = lowest(smoothed(costs, target.coarse_grey))
-    change = _enlarged(np.asarray(cv2.medianBlur(coarse, 5), np.float32), target)
-    for _ in range(STEPS):
-        step, information, fit = _gauss_newton(target.levels, views, inverse * np.exp(change))
-        change += step
-    return Measurement(target, depth, K, change, information, fit, costs, coarse)
-
-
-def _enlarged(change: Array, target: Appearance) -> Array:
-    """To full size ``(H, W)``: a pixel takes the change of the one of four at half size with the nearest grey level."""
-    height, width = target.grey.shape
-    changes = _doubled(change)
-    greys = _doubled(target.coarse_grey)
-    best = np.empty_like(target.grey)
-    nearest = np.full_like(target.grey, np.inf)
-    for top in (0, 2):
-        for left in (0, 2):
-            at = slice(top, top + height), slice(left, left + width)
-            apart = cv2.absdiff(greys[at], target.grey)
-            closer = apart < nearest
-            np.copyto(best, changes[at], where=closer)
-            np.copyto(nearest, apart, where=closer)
-    return best
-
-
-def _doubled(part: Array) -> Array:
-    """Each pixel ``(h, w)`` four times, with a border of one before and two behind."""
-    twice = cv2.resize(part, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
-    return np.asarray(cv2.copyMakeBorder(twice, 1, 2, 1, 2, cv2.BORDER_REPLICATE))
+        views.append((other, Projection(K, T, *depth.shape)))
+    costs = sweep(target.levels, [(other.levels, where) for other, where in views], inverse)
+    coarse = lowest(smoothed(costs, target.grey))
+    change = np.asarray(cv2.medianBlur(coarse, 5), np.float32)
+    step, information, fit = _gauss_newton(target.levels, views, inverse * np.exp(change))
+    return Measurement(target, depth, K, change + step, information, fit, costs, coarse)
 
 
 def _gauss_newton(

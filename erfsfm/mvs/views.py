@@ -28,31 +28,23 @@ LEAST_Z = 1e-3
 
 @dataclass(frozen=True)
 class Appearance:
-    """A grey image ``(H, W)`` and at half size ``(h, w)``: grey levels, plain and normalised.
+    """A grey image ``(H, W)``: its levels, plain and normalised.
 
-    ``slopes`` are the derivatives of ``levels`` along x and y.
+    ``slopes`` are the derivatives of the normalised ones along x and y.
     """
 
     grey: Array
     levels: Array
     slopes: tuple[Array, Array]
-    coarse: Array
-    coarse_grey: Array
 
     @classmethod
     def of(cls, grey: Grey) -> Appearance:
         """Normalise a grey image ``(H, W)``."""
-        height, width = grey.shape
-        half = cv2.resize(
-            grey, (max(width // 2, 1), max(height // 2, 1)), interpolation=cv2.INTER_AREA
-        )
-        full, small = grey.astype(np.float32), np.asarray(half, np.float32)
+        full = grey.astype(np.float32)
         levels = normalised(full)
         along_x = cv2.Sobel(levels, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
         along_y = cv2.Sobel(levels, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
-        return cls(
-            full, levels, (np.asarray(along_x), np.asarray(along_y)), normalised(small), small
-        )
+        return cls(full, levels, (np.asarray(along_x), np.asarray(along_y)))
 
 
 def normalised(grey: Array) -> Array:
@@ -143,11 +135,3 @@ class Projection:
         k = inverse_depth / z
         moved = self._moved
         return (moved[0] - u * moved[2]) * k, (moved[1] - v * moved[2]) * k
-
-
-def halved(K: NDArray[np.floating]) -> NDArray[np.float64]:
-    """The camera matrix of an image of half the size; pixel centres are at integers."""
-    half = np.array(K, dtype=np.float64)
-    half[:2] *= 0.5
-    half[:2, 2] -= 0.25
-    return half

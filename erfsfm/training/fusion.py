@@ -6,11 +6,13 @@ import json
 import math
 from collections.abc import Sequence
 from functools import partial
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 
 import numpy as np
+import onnx
 import torch
+from onnx import numpy_helper
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -21,7 +23,7 @@ from erfsfm.common.progress import Progress
 from erfsfm.data.discovery import discover
 from erfsfm.data.recordings import Recording
 from erfsfm.inference import DepthPosePredictor, has_bfloat16
-from erfsfm.mvs.fusion import CHANGE, CHANNELS, FILE, FULL_SIZE, STEP
+from erfsfm.mvs.fusion import CHANGE, CHANNELS, FILE, FULL_SIZE, STEP, DepthFusion
 from erfsfm.networks.torch_network import exported
 from erfsfm.training.fusion_samples import FusionSamples, Sample
 
@@ -33,6 +35,7 @@ _LARGEST_CHANGE = 2.0
 RECORD = "fusion.json"
 _BATCH = 8
 _LEARNING_RATE, _LEAST_RATE = 2e-3, 0.01
+_LATER_RATE = 5e-4  # of a network that was trained before
 _WARM_UP = 100
 _WEIGHT_DECAY = 1e-3
 _HUBER = 0.02  # of log depth
@@ -73,6 +76,29 @@ class FusionNet(nn.Module):
         with torch.no_grad():
             self.head.bias.copy_(torch.tensor([_TRUST, 0.0, _UNSURE]).repeat_interleave(4))
 
+    def begin_with(self, path: Path) -> None:
+        """Take the weights of a network that was exported, whose norms are parts of its convolutions, and stay so.
+
+        Args:
+            path: of its ``fusion.onnx``.
+        """
+        graph = onnx.load(path).graph
+        values = {each.name: numpy_helper.to_array(each) for each in graph.initializer}
+        convolutions = iter([node.input for node in graph.node if node.op_type == "Conv"])
+        bias = torch.empty(0)
+        with torch.no_grad():
+            for part in (*self.down, *chain(*zip(self.narrow, self.up, strict=True)), self.head):
+                for layer in part.modules():
+                    if isinstance(layer, nn.Conv2d):
+                        _, weights, biases = next(convolutions)
+                        layer.weight.copy_(torch.tensor(values[weights]))
+                        bias = torch.tensor(values[biases])
+                    elif isinstance(layer, nn.BatchNorm2d) and layer.running_var is not None:
+                        layer.running_var.fill_(1 - layer.eps)
+                    if isinstance(layer, nn.Conv2d | nn.BatchNorm2d) and layer.bias is not None:
+                        layer.bias.copy_(bias)
+        self.eval()
+
     def forward(self, evidence: Tensor) -> tuple[Tensor, Tensor]:
         """See the class."""
         kept = [self.down[0](evidence)]
@@ -111,6 +137,7 @@ def train_fusion(
     seed: int,
     command: str,
     progress: Progress,
+    start: str | None = None,
 ) -> dict[str, float]:
     """Train on simulated worlds, write ``fusion.onnx`` and a record; returns the errors on the validation's worlds.
 
@@ -124,8 +151,10 @@ def train_fusion(
         seed: of everything drawn.
         command: for the record.
         progress: is told.
+        start: the network to begin with, as `DepthFusion` names it, instead of a fresh one.
 
     Raises:
+        CheckpointError: there is no such network.
         TrainingError: data without depth or poses, or a file of another program in the way.
     """
     assert STEP == 2**LEVELS, "evidence is padded for another network"
@@ -135,9 +164,12 @@ def train_fusion(
             f"{output / FILE} is not of train-fusion and would be replaced: choose another --output"
         )
     output.mkdir(parents=True, exist_ok=True)
+    net = FusionNet(CHANNELS, 4 * CHANGE)
+    if start is not None:
+        net.begin_with(DepthFusion(start).path)
     data = _drawn(datasets, weights, samples, seed, progress)
     held_out = _drawn(validation, weights, max(samples // 20, _CHUNK), _VALIDATION_SEED, progress)
-    net = FusionNet(CHANNELS, 4 * CHANGE).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     _optimise(net, data, steps, seed, progress)
     net.eval()
     metrics = _fit_sigma(net, held_out)
@@ -148,6 +180,7 @@ def train_fusion(
     record = {
         "command": command,
         "weights": weights,
+        "start": start,
         "samples": samples,
         "steps": steps,
         "seed": seed,
@@ -184,7 +217,9 @@ def _optimise(
     net: FusionNet, data: Sequence[Sample], steps: int, seed: int, progress: Progress
 ) -> None:
     rng = np.random.default_rng(seed)
-    optimiser = torch.optim.AdamW(net.parameters(), _LEARNING_RATE, weight_decay=_WEIGHT_DECAY)
+    # a network that was trained before is not in training mode: its norms stay
+    most = _LEARNING_RATE if net.training else _LATER_RATE
+    optimiser = torch.optim.AdamW(net.parameters(), most, weight_decay=_WEIGHT_DECAY)
 
     def rate(step: int) -> float:
         return min(1, (step + 1) / _WARM_UP) * max(

@@ -26,6 +26,7 @@ _LEFT_OUT = 0.1  # chance of each neighbour
 _WEATHER = 0.4
 _SCALE_SPREAD = 0.04
 _TURN_ERROR_DEG = 0.02
+_DIRECTION_ERROR_DEG = 0.35  # of a motion, as runs have it on KITTI 00, 02 and 05
 _LENGTH_ERROR = 0.01
 _LEAST_KNOWN = 0.3  # of the pixels of a frame
 _MOST_TRIES = 200  # frames until one has depth and neighbours
@@ -114,9 +115,12 @@ class FusionSamples:
         target, *others = (Appearance.of(_recorded(image, rng)) for image in images)
         T_neighbour_target = np.linalg.inv(T_world_camera[chosen]) @ T_world_camera[index]
         for T in T_neighbour_target:
-            turn, _ = cv2.Rodrigues(rng.normal(0, np.deg2rad(_TURN_ERROR_DEG), 3))
+            turn, aside = (
+                cv2.Rodrigues(rng.normal(0, np.deg2rad(error), 3))[0]
+                for error in (_TURN_ERROR_DEG, _DIRECTION_ERROR_DEG)
+            )
             T[:3, :3] = T[:3, :3] @ turn
-            T[:3, 3] *= 1 + rng.normal(0, _LENGTH_ERROR)
+            T[:3, 3] = aside @ T[:3, 3] * (1 + rng.normal(0, _LENGTH_ERROR))
         K = camera.resized(WIDTH, height).K.astype(np.float64)
         channels = evidence(measure(target, guess, others, K, T_neighbour_target))
         is_known = truth > 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
@@ -10,18 +12,23 @@ from slam.runtime.errors import Failed
 from slam.runtime.record import Count, Record
 
 LEAST_M, LARGEST_M = 1.0, 80.0
+_RANGES_M = LEAST_M, 5.0, 10.0, 20.0, 40.0, LARGEST_M  # between which errors are told apart
 COVERAGES = (50, 90, 95)
 _PIXELS_OF_A_FRAME = 3000
 _MOST_FRAMES = 500  # held; of a longer drive every second frame, every fourth, and so on
 
 
 class DepthMetrics(Record):
-    """The object D of ``metrics.json``; ``coverage`` is the share of errors inside so many per cent of the noise."""
+    """The object D of ``metrics.json``; ``coverage`` is the share of errors inside so many per cent of the noise.
+
+    ``by_range`` is ``abs_rel`` of true depths in metres: ``1-5``, ``5-10`` and so on.
+    """
 
     abs_rel: float | None = None
     median_rel: float | None = None
     rmse_m: float | None = None
     a1: float | None = None
+    by_range: dict[str, float] | None = None
     coverage: dict[str, float] | None = None
     frames: Count | None = None
 
@@ -74,6 +81,11 @@ class DepthErrors:
         depth, truth, sigma = np.concatenate(self._depths, axis=1).astype(np.float64)
         relative = np.abs(depth - truth) / truth
         ratio = np.maximum(depth / truth, truth / np.maximum(depth, 1e-9))
+        by_range = {}
+        for near, far in pairwise(_RANGES_M):
+            inside = (truth >= near) & (truth < far)
+            if inside.any():
+                by_range[f"{near:g}-{far:g}"] = float(relative[inside].mean())
         coverage: dict[str, float] | Failed = Failed("the network states no noise of its depth")
         if not np.isnan(sigma).any():
             errors = np.log(ratio) / sigma
@@ -85,6 +97,7 @@ class DepthErrors:
             median_rel=float(np.median(relative)),
             rmse_m=float(np.sqrt(np.square(depth - truth).mean())),
             a1=float((ratio < 1.25).mean()),
+            by_range=by_range,
             coverage=coverage,
             frames=len(self._depths),
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +15,13 @@ from erfsfm.common.errors import DataError
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.discovery import discover, named_recordings
 from erfsfm.data.many_view_teacher import ManyViewTeacher
-from erfsfm.evaluation.depth_protocols import TRUTH_FOLDER, depth_protocol, many_view_protocol
+from erfsfm.evaluation import depth_protocols
+from erfsfm.evaluation.depth_protocols import (
+    TRUTH_FOLDER,
+    depth_protocol,
+    many_view_protocol,
+    refined_protocol,
+)
 from erfsfm.evaluation.streets import EVERY
 from erfsfm.training.run import prepare
 from slam.simulation.kitti_layout import write_kitti_root
@@ -52,6 +59,42 @@ def test_depth(tmp_path: Path, write_root: Callable[..., Path]) -> None:
     assert networks["scale"] == pytest.approx(np.mean([6.0, 5.5, 5.0]) / 3, abs=1e-3)
     assert networks["scale_spread"] == pytest.approx(np.std([6.0, 5.5, 5.0]) / 5.5, abs=1e-3)
     assert median["method"] == "median depth map"
+
+
+def test_refined_depth_of_pairs_with_masks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run of each street against all of the truth, what stands and what moves; too short a street is left out."""
+    for folder in ("images", "truth", "moving", "calib"):
+        (tmp_path / folder).mkdir()
+    truth, moves = np.full((20, 40), 2560, np.uint16), np.zeros((20, 40), np.uint8)
+    moves[:5] = 255
+    for name in ("a_000000", "a_000001", "b_000000"):
+        cv2.imwrite(str(tmp_path / f"images/{name}.png"), np.zeros((20, 40, 3), np.uint8))
+        cv2.imwrite(str(tmp_path / f"truth/{name}.png"), truth)
+        cv2.imwrite(str(tmp_path / f"moving/{name}.png"), moves)
+        (tmp_path / f"calib/{name}.txt").write_text("30 30 20 10 40 20")
+
+    def run(words: list[str]) -> str:
+        sequence = Path(words[words.index("--dataset") + 1]) / "sequences" / "00"
+        maps = sorted((sequence / "depth_2").iterdir())
+        assert len(maps) == len(list((sequence / "image_2").iterdir()))
+        assert (sequence / "calib.txt").read_text().startswith("P2: 30.0 0 20.0")
+        if len(maps) == 1:
+            return "too short"
+        share = float((cv2.imread(str(maps[0]), cv2.IMREAD_UNCHANGED) > 0).mean())
+        errors = {"abs_rel": share, "median_rel": 0.1, "coverage": {"90": 0.9}, "frames": 2}
+        refined = errors | {"by_range": {"5-10": share}}
+        output = Path(words[words.index("--output") + 1])
+        output.mkdir()
+        depth = {"network": {"abs_rel": 0.5}, "refined": refined}
+        (output / "metrics.json").write_text(json.dumps({"depth": depth}))
+        return ""
+
+    monkeypatch.setattr(depth_protocols, "slam_process", run)
+    mean, *rows = refined_protocol(Flat(), "default", [tmp_path], allow_leak=False)
+    names = [row["street"].removeprefix(f"folder/{tmp_path.name}/") for row in rows]
+    assert names == ["a", "a static", "a moving"]
+    assert [row["refined"] for row in rows] == [1.0, 0.75, 0.25]
+    assert (mean["streets"], mean["refined"], mean["learned"]) == (1, 1.0, 0.5)
 
 
 def test_depth_of_a_pack(

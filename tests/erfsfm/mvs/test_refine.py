@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from erfsfm.mvs.fusion import DepthFusion
-from erfsfm.mvs.refine import RefinedDepth, measure
+from erfsfm.mvs.refine import Measurement, RefinedDepth, measure
 from erfsfm.mvs.views import Appearance
 
 H, W = 96, 240
@@ -34,13 +34,13 @@ def painted(which: int, a: np.ndarray, b: np.ndarray, scale: float) -> np.ndarra
 
 
 def wall_and_step(
-    position: tuple[float, float, float], far: float = 12.0
+    position: tuple[float, float, float], far: float = 12.0, left: float = -np.inf, right: float = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A wall, and 6 m away a board in front of its left half: image and depth."""
+    """A wall, and 6 m away a board in front of it, by default of its left half: image and depth."""
     x, y, z = position
     near_x, near_y = X * (6 - z) + x, Y * (6 - z) + y
     far_x, far_y = X * (far - z) + x, Y * (far - z) + y
-    board = near_x < 0
+    board = (near_x > left) & (near_x < right)
     image = np.where(board, painted(0, near_x, near_y, 40.0), painted(1, far_x, far_y, 240.0 / far))
     return image.astype(np.uint8), np.where(board, 6 - z, far - z).astype(np.float32)
 
@@ -58,12 +58,23 @@ def road_and_car(
     return image.astype(np.uint8), np.where(car, 8.0, depth).astype(np.float32), car
 
 
-def refined(images: list[np.ndarray], prior: np.ndarray, unit: float = 1.0) -> RefinedDepth:
-    """The first image, refined by the others at ``POSITIONS``; a metre is so many units."""
+def measured(images: list[np.ndarray], prior: np.ndarray, unit: float = 1.0) -> Measurement:
+    """What the others say of the first image at ``POSITIONS``; a metre is so many units."""
     T = np.tile(np.eye(4), (len(POSITIONS), 1, 1))
     T[:, :3, 3] = -unit * np.array(POSITIONS)
     target, *others = (Appearance.of(image) for image in images)
-    return DECIDE(measure(target, (unit * prior).astype(np.float32), others, K, T))
+    return measure(target, (unit * prior).astype(np.float32), others, K, T)
+
+
+def refined(images: list[np.ndarray], prior: np.ndarray, unit: float = 1.0) -> RefinedDepth:
+    return DECIDE(measured(images, prior, unit))
+
+
+def test_a_post_of_six_pixels_is_measured() -> None:
+    views = [wall_and_step(p, left=-3.0, right=-2.76) for p in [(0.0, 0.0, 0.0), *POSITIONS]]
+    found = measured([image for image, _ in views], np.full((H, W), 9.0))
+    post = (found.depth * np.exp(-found.change))[views[0][1] < 7]
+    assert (np.abs(post - 6) < 0.6).mean() > 0.9
 
 
 def test_a_wall_and_a_step_are_found_from_a_wrong_guess() -> None:

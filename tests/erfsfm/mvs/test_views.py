@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from erfsfm.mvs.views import Projection, halved
+from erfsfm.mvs.views import Projection
 
 K = np.array([[90.0, 0.0, 15.0], [0.0, 80.0, 9.0], [0.0, 0.0, 1.0]])
 
@@ -31,10 +31,3 @@ def test_derivatives_are_those_of_small_differences() -> None:
     after, before = (projection.pixels(inverse * np.float32(np.exp(h))) for h in (0.01, -0.01))
     np.testing.assert_allclose(du, (after[0] - before[0]) / 0.02, atol=2e-2)
     np.testing.assert_allclose(dv, (after[1] - before[1]) / 0.02, atol=2e-2)
-
-
-def test_halving_keeps_rays() -> None:
-    # the centre of the first half-size pixel is between the first four pixels
-    np.testing.assert_allclose(
-        np.linalg.inv(halved(K)) @ [0, 0, 1], np.linalg.inv(K) @ [0.5, 0.5, 1]
-    )

@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from onnxruntime import InferenceSession
 
 from erfsfm.cli import main
-from erfsfm.mvs.fusion import CHANGE, CHANNELS
+from erfsfm.mvs.fusion import CHANGE, CHANNELS, DepthFusion
 from erfsfm.training.fusion import FusionNet, fusion_loss
 
 Cli = Callable[..., tuple[int, str, str]]
@@ -103,6 +104,16 @@ def test_a_network_is_trained_on_worlds_and_refines_a_run(
         ]
         < 0.5
     )
+
+
+def test_a_network_begins_with_the_shipped_one() -> None:
+    evidence = torch.randn(1, CHANNELS, 16, 24, generator=torch.Generator().manual_seed(0))
+    net = FusionNet(CHANNELS, 4 * CHANGE)
+    path = DepthFusion("default").path
+    net.begin_with(path)
+    shipped = InferenceSession(path).run(None, {"evidence": evidence.numpy()})
+    for found, expected in zip(net(evidence), shipped, strict=True):
+        np.testing.assert_allclose(found.detach().numpy(), expected, atol=1e-4)
 
 
 def test_a_fresh_network_trusts_the_measurement_at_every_pixel() -> None:

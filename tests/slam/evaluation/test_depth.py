@@ -25,6 +25,15 @@ def test_numbers_of_a_constant_error() -> None:
     assert summary["coverage"] is None and summary["coverage_reason"]
 
 
+def test_errors_by_range() -> None:
+    truth = TRUTH.copy()
+    truth[:, :20] = 30
+    errors = DepthErrors()
+    errors.add(np.full_like(TRUTH, 33), truth)
+    by_range = errors.metrics().tree()["by_range"]
+    assert by_range == pytest.approx({"10-20": 2.3, "20-40": 0.1})
+
+
 def test_correct_sigmas_cover() -> None:
     rng = np.random.default_rng(0)
     errors = DepthErrors()

@@ -258,7 +258,7 @@ def of_focal_length(found: FocalLength, camera: Intrinsics) -> Agreement | None:
     sigmas = abs(logarithm) / float(np.hypot(np.hypot(_FOCAL, sigma), camera.focal_sigma))
     is_guess = camera.focal_sigma > SURE
     figure = "nobody calibrated it" if is_guess else ""
-    if sigma < _TELLING_FOCAL or sigmas > DOUBTFUL:
+    if sigma < _TELLING_FOCAL or (sigmas > DOUBTFUL and not is_guess):
         figure += f"{', ' if figure else ''}measured from corners it is {100 * np.exp(logarithm):.0f} % of the given"
         figure += f", give or take {100 * sigma:.0f} %"
         if sigmas > DOUBTFUL:

@@ -56,8 +56,8 @@ class Submap:
     ``keys`` ``(B, 3)`` int32 are coordinates of blocks of 16 voxels a side, ``observed`` ``(B, 512)`` the bits of their
     voxels in the order z, y, x; ``tsdf`` ``(S,)`` float16 in truncation distances and ``weight`` ``(S,)`` uint16 belong
     to the observed ones. Of each view: ``T_world_camera`` ``(K, 4, 4)``, image ``(K, h, w, 3)``, fused depth
-    ``(K, h, w)`` float16, 0 where nothing was fused, and ``brightness_steps`` ``(K,)``: the logarithm of its brightness
-    over that of the view before, NaN where they share nothing. ``camera`` is fx, fy, cx, cy.
+    ``(K, h, w)`` float16, 0 where nothing was fused, and ``brightness_steps`` ``(K, 3)`` by `_brightness_step`.
+    ``camera`` is fx, fy, cx, cy.
     """
 
     keys: NDArray[np.int32]
@@ -215,7 +215,7 @@ class ViewChooser:
         """Of the camera of these filters; ``depth_max_m`` is the largest fused depth."""
         self._filters, self._step_m = filters, _STEP * depth_max_m
         self._chosen: list[KeyframeDepth] = []
-        self._steps: list[float] = []
+        self._steps: list[FloatArray] = []
         self._begin: FloatArray | None = None
         self._best: tuple[float, KeyframeDepth] | None = None  # with its sharpness
         self._last: KeyframeDepth | None = None
@@ -248,7 +248,7 @@ class ViewChooser:
             "depths": np.array([view.depth for view in views], dtype=np.float16).reshape(
                 -1, height, width
             ),
-            "brightness_steps": np.array(steps, dtype=np.float64),
+            "brightness_steps": np.array(steps, dtype=np.float64).reshape(-1, 3),
             "camera": np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
         }
 
@@ -256,24 +256,37 @@ class ViewChooser:
         if self._best is not None:
             _, view = self._best
             self._steps.append(
-                np.nan if self._last is None else self._brightness_step(view, self._last)
+                np.full(3, np.nan)
+                if self._last is None
+                else self._brightness_step(view, self._last)
             )
             self._chosen.append(view)
             self._last = view
         self._begin = self._best = None
 
-    def _brightness_step(self, view: KeyframeDepth, before: KeyframeDepth) -> float:
-        """Logarithm of the brightness of surfaces that two views share, over that in the one before."""
+    def _brightness_step(self, view: KeyframeDepth, before: KeyframeDepth) -> FloatArray:
+        """How the surfaces that two views share change from the one before ``(3,)``, NaN where they share too few.
+
+        The logarithm of their brightness, how much further from the middle they are seen (`_outwards`),
+        and the slope of the first over the second: surfaces that come nearer move outwards, where a
+        lens darkens the image, which is no change of exposure.
+        """
         u, v, z = self._filters.projected(view, before)
         same = np.abs(sampled(before.depth, u, v) - z) < _SAME_SURFACE * z
-        here, there = (
-            grey[same][::_STRIDE]
-            for grey in (_grey(view.image), sampled(_grey(before.image), u, v))
+        rows, columns = np.nonzero(same)
+        of_both = (
+            _grey(view.image)[same],
+            sampled(_grey(before.image), u, v)[same],
+            _outwards(columns, rows, same.shape) - _outwards(u[same], v[same], same.shape),
         )
+        here, there, moved = (each[::_STRIDE] for each in of_both)
         usable = (np.minimum(here, there) > _DARK) & (np.maximum(here, there) < _BRIGHT)
         if usable.sum() < _LEAST_SHARED:
-            return float("nan")
-        return float(np.median(np.log(here[usable]) - np.log(there[usable])))
+            return np.full(3, np.nan)
+        change, moved = np.log(here[usable] / there[usable]), moved[usable]
+        far = moved > np.median(moved)
+        rise, run = (np.median(each[far]) - np.median(each[~far]) for each in (change, moved))
+        return np.array([np.median(change), np.median(moved), rise / max(run, 1e-3)])
 
 
 def has_moved(
@@ -301,6 +314,15 @@ def moved_rows(T_world_camera: FloatArray, step_m: float, turn_deg: float) -> li
     return chosen
 
 
+def _outwards(
+    u: NDArray[np.floating[Any]], v: NDArray[np.floating[Any]], shape: tuple[int, ...]
+) -> FloatArray:
+    """Squared distance of pixels ``(M,)`` from the middle of an image ``(h, w)``, in half its width."""
+    height, width = shape[:2]
+    x, y = 2.0 * u - width + 1.0, 2.0 * v - height + 1.0
+    return np.asarray((x**2 + y**2) / width**2, np.float64)
+
+
 def _grey(image: Image) -> FloatArray:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.float64)
 
@@ -309,9 +331,12 @@ class Painter:
     """Colours points by the views of all submaps."""
 
     def __init__(self, submaps: MergedSubmaps, voxel_size_m: float, reach_m: float) -> None:
-        """Even out the exposure of all views."""
+        """Even out the exposure of all views, and what their lens darkens."""
         self._submaps, self._voxel, self._range = submaps, voxel_size_m, reach_m
-        self._gains = np.exp(-evened(submaps.brightness_steps))
+        steps, outwards, slopes = submaps.brightness_steps.T
+        known = slopes[np.isfinite(slopes)]
+        self._darkening = float(np.median(known)) if len(known) else 0.0
+        self._gains = np.exp(-evened(steps - self._darkening * outwards))
 
     def colours(self, points_world: FloatArray) -> NDArray[np.uint8]:
         """RGB ``(P, 3)`` of points of the surface ``(P, 3)``; one that no view shows has that of the nearest shown."""
@@ -355,9 +380,10 @@ class Painter:
         same = (known > 0) & (
             np.abs(known - z) < np.maximum(_SAME_VOXELS * self._voxel, _SAME_SURFACE * z)
         )
-        shown, share = ahead[same], z[same] ** -_NEARNESS
+        shown, share, u, v = ahead[same], z[same] ** -_NEARNESS, u[same], v[same]
         weight[shown] += share
-        total[shown] += share[:, None] * (self._gains[view] * image[v[same], u[same]])
+        lens = np.exp(-self._darkening * _outwards(u, v, depth.shape))
+        total[shown] += (share * self._gains[view] * lens)[:, None] * image[v, u]
 
 
 def evened(brightness_steps: FloatArray) -> FloatArray:

@@ -33,6 +33,7 @@ def street_map() -> StreetMap:
         hidden: bool = False,
         per_metre: float = 1.0,
         frames: int = 18,
+        darkening: float = 0.0,
         **config: float,
     ) -> TsdfMap:
         settings = MappingConfig(**{"depth_max_m": 20.0, **config}).in_unit(per_metre)
@@ -44,7 +45,8 @@ def street_map() -> StreetMap:
                 on_road = (depth * _Y > 1.6) & (np.abs(depth * _X) < 0.5) & (np.abs(z - 20.0) < 0.5)
                 depth = np.where(on_road, 0, depth).astype(np.float32)
             noise = np.random.default_rng(k).normal(0, 2, (CAMERA.height, CAMERA.width, 1))
-            image = np.clip(grey(k) + noise, 0, 255).astype(np.uint8).repeat(3, axis=2)
+            lens = np.exp(darkening * (_X**2 + _Y**2))[..., None]
+            image = np.clip(grey(k) * lens + noise, 0, 255).astype(np.uint8).repeat(3, axis=2)
             T_world_camera = se3.make(np.eye(3), np.array([0.0, 0.0, per_metre * k]))
             tsdf_map.integrate(
                 KeyframeDepth(k, np.float32(per_metre) * depth, None, image, T_world_camera)

@@ -38,6 +38,14 @@ def test_exposure_is_evened_out(street_map):
     assert 0.4 < changing.mean() < 0.75
 
 
+def test_a_lens_that_darkens_its_corners_does_not_darken_the_end_of_a_map(street_map):
+    """What comes nearer moves outwards and gets darker, from each view to the next."""
+    mesh = street_map(grey=lambda k: 150.0, frames=30, darkening=-0.5).mesh()
+    middle = np.median(mesh.colours)
+    for end in (mesh.points[:, 2] < 8, mesh.points[:, 2] > 35):
+        assert np.median(mesh.colours[end]) == pytest.approx(middle, rel=0.05)
+
+
 def test_brightness_steps_become_small_gains():
     steps = np.array([np.nan, 0.4, -0.4, np.nan, 0.2])
     brightness = evened(steps)

@@ -105,9 +105,10 @@ def map_errors(metrics: Metrics) -> Table | None:
     rings = found.with_scale.by_distance if found.by_distance is None else found.by_distance
     for ring in rings or ():
         rows[f"{ring.from_m:.0f} to {ring.to_m:.0f} m from the camera"] = ring
-    texts = []
-    for name, each in rows.items():
-        texts.append([name, *(number(each.at(path)[0], 3) for path in _MAP_ERRORS.values())])
+    texts = [
+        [name, *(number(each.at(path)[0], 3) for path in _MAP_ERRORS.values())]
+        for name, each in rows.items()
+    ]
     truth, length = _TRUTHS.get(found.truth, found.truth), number(found.evaluated_m)
     note = (
         f"Against {truth}, {length} m of the path. Map where no surface was measured is an error."

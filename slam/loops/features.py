@@ -95,8 +95,8 @@ def describe(grey: Grey, pixels: NDArray[np.floating[Any]]) -> Descriptors:
     half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     places = (0.5 * pixels.astype(np.float64) - 0.25).tolist()
     corners = [
-        cv2.KeyPoint(*place, _SIFT_SIZE_PX / 2, float(angle), 1.0, 0, 0)
-        for place, angle in zip(places, _directions_deg(grey, pixels), strict=True)
+        cv2.KeyPoint(x, y, _SIFT_SIZE_PX / 2, float(angle))
+        for (x, y), angle in zip(places, _directions_deg(grey, pixels), strict=True)
     ]
     _, values = cv2.SIFT.create().compute(half, corners)
     roots = np.sqrt(values / np.maximum(values.sum(axis=1, keepdims=True), 1e-9))

@@ -60,8 +60,14 @@ def application(name: str, about: str) -> typer.Typer:
             is_eager=True,
             help="print the version and exit",
         ),
+        quiet: bool = typer.Option(False, "--quiet", "-q", help="no warnings on the terminal"),
+        verbose: bool = typer.Option(False, "--verbose", "-v", help="say there what the log says"),
     ) -> None:
-        pass
+        root = logging.getLogger()
+        if quiet or verbose:
+            root.setLevel(logging.ERROR if quiet else logging.INFO)
+            for handler in root.handlers:
+                handler.setLevel(root.level)
 
     return app
 

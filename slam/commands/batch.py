@@ -30,6 +30,7 @@ from slam.config.sections import load_config
 from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics
 from slam.results.tables import written
+from slam.results.verdict import verdict
 from slam.runtime.errors import RunError, SequenceError, SlamError
 from slam.runtime.files import from_anywhere, source_from_anywhere, write_atomically
 from slam.runtime.imports import import_extra
@@ -55,6 +56,11 @@ _COLUMNS: dict[str, tuple[Callable[[Metrics], object], int | None]] = {
     "ate_7dof_m": (lambda m: m.trajectories.optimised.align.dof7.ate_rmse_m, 3),
     "t_rel_percent": (lambda m: m.trajectories.optimised.align.dof7.t_rel_percent, 2),
     "r_rel_deg_per_100m": (lambda m: m.trajectories.optimised.align.dof7.r_rel_deg_per_100m, None),
+    "confidence": (lambda m: m.confidence.run, 2),
+    "path": (lambda m: m.motion.path, None),
+    "mean_speed": (lambda m: m.motion.mean_speed, None),
+    "top_speed": (lambda m: m.motion.top_speed, None),
+    "doubts": (lambda m: "; ".join(said.doubts) if (said := verdict(m)) else None, None),
     "interpolated_frames": (lambda m: m.sequence.bridged_frames, None),
     "loops": (lambda m: m.loops.accepted, None),
     "map_triangles": (lambda m: m.map.triangles, None),
@@ -169,7 +175,11 @@ def run_drives(
         outcomes[number] = result
         progress("drives", len(outcomes), len(drives))
     ordered = [outcomes[number] for number in range(len(drives))]
-    write_atomically(output / CSV, csv_of(map(_row, ordered)), RunError)
+    rows = list(map(_row, ordered))
+    if (output / CSV).exists():  # an earlier batch may have had other drives
+        names, before = {drive.name for drive in drives}, io.StringIO(read_text(output / CSV))
+        rows = [row for row in csv.DictReader(before) if row["drive"] not in names] + rows
+    write_atomically(output / CSV, csv_of(rows), RunError)
     return ordered
 
 
@@ -197,14 +207,11 @@ def spread(
         "threads_per_worker": 1,
         "dashboard_address": ":0",
         "memory_limit": None,
+        "silence_logs": logging.CRITICAL,
     }
-    local |= {"silence_logs": logging.CRITICAL}
     try:
-        client = (
-            distributed.Client(scheduler, timeout="10s")
-            if scheduler
-            else distributed.Client(**local)
-        )
+        there = {"address": scheduler, "timeout": "10s"}
+        client = distributed.Client(**there if scheduler else local)
     except (OSError, ValueError) as error:
         raise SlamError(
             f"no Dask scheduler answers at {scheduler}: {one_line(str(error))}"

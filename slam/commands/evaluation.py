@@ -192,11 +192,8 @@ def _rows(runs: Sequence[SystemRun]) -> Iterator[list[str]]:
 
 def _spread(column: tables.ErrorColumn, runs: Sequence[SystemRun]) -> str:
     """The number of one run; of several the mean and the deviation of those that have it."""
-    values = []
-    for run in runs:
-        value, _ = run.errors.at(column.path)
-        if value is not None:
-            values.append(value)
+    numbers = (run.errors.at(column.path)[0] for run in runs)
+    values = [number for number in numbers if number is not None]
     if len(values) < 2:
         return tables.written(values[0] if values else None, column.decimals)
     mean, deviation = float(np.mean(values)), float(np.std(values, ddof=1))

@@ -161,10 +161,8 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
 def write_kitti(path: Path | str, trajectory: Trajectory) -> None:
     """Write the upper 3x4 of each ``T_world_camera``, row by row, atomically; after its number where it has one."""
     rows = trajectory.T_world_camera[:, :3].reshape(len(trajectory), 12)
-    lines: list[str] = []
-    for stamp, row in zip(trajectory.stamps, rows):
-        number = f"{stamp:.0f} " if trajectory.numbered else ""
-        lines.append(f"{number}{_row(row)}\n")
+    begin = "{:.0f} " if trajectory.numbered else ""
+    lines = (f"{begin.format(k)}{_row(row)}\n" for k, row in zip(trajectory.stamps, rows))
     write_atomically(Path(path), "".join(lines), TrajectoryError)
 
 

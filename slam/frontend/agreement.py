@@ -24,7 +24,7 @@ from slam.runtime.errors import Failed, SlamError
 
 logger = logging.getLogger(__name__)
 
-DOUBTFUL, WRONG = 2.0, 5.0  # sigmas
+DOUBTFUL, _CLEAR, WRONG = 2.0, 3.0, 5.0  # sigmas
 _ROTATION_RAD, _DIRECTION_RAD = np.deg2rad(0.3), np.deg2rad(3.0)  # of a step by images
 _HEIGHT = 0.1  # relative, of a stated camera height and of the road that images show
 _USUAL_HEIGHT_M, _USUAL_FACTOR = 1.0, 10.0  # of cameras whose height nobody stated
@@ -232,9 +232,7 @@ def of_images(
     if needs_road and steps and too_far is not None:
         figure = f"it is up to {100 * np.expm1(too_far):.0f} % farther than triangulated, as where a lens zooms"
         compared("learned depth far away", too_far / _FAR_SPREAD, figure)
-    by_corners = of_focal_length(drive.focal_length, camera)
-    if by_corners is not None:
-        agreements.append(by_corners)
+    agreements += filter(None, [of_focal_length(drive.focal_length, camera)])
     for each in agreements[1:]:  # gaps and segments were said by their frames
         each.said()
     return agreements
@@ -261,7 +259,7 @@ def of_focal_length(found: FocalLength, camera: Intrinsics) -> Agreement | None:
     if sigma < _TELLING_FOCAL or (sigmas > DOUBTFUL and not is_guess):
         figure += f"{', ' if figure else ''}measured from corners it is {100 * np.exp(logarithm):.0f} % of the given"
         figure += f", give or take {100 * sigma:.0f} %"
-        if sigmas > DOUBTFUL:
+        if sigmas > _CLEAR:
             figure += ": --camera auto measures it where the camera turns"
     if is_guess:
         return Agreement("the guessed focal length", max(sigmas, _CAPPED), figure, "good drives")

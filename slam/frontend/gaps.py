@@ -56,10 +56,8 @@ def interpolate_gaps(
     frozen, steps = _without_frozen(by_network, drive.steps, map_poses, drive.repeated, new)
     frames = drive.unusable | dict.fromkeys(frozen, "the image stands still while the camera moves")
     trusted = [snippet for snippet in drive.snippets if _is_trusted(snippet, frozen, cuts)]
-    by_image = {}
-    for (first, last), step in steps.items():
-        if last == first + 1:
-            by_image[first] = step.relative_pose.T_from_to
+    single = (pose for pose in _poses(steps) if pose.to_index == pose.from_index + 1)
+    by_image = {pose.from_index: pose.T_from_to for pose in single}
     # snippets of frozen images alone are still the best estimate available
     known = calibration.scaled(network_steps(trusted)) | by_image or by_network
     covered = set(by_image)

@@ -186,7 +186,9 @@ def find_scale(
     with_road = max(used, 0 if isinstance(by_planes, Failed) else by_planes.frames_used)
     if named == "camera heights" and with_road < _LEAST_ROAD * frames:
         named = "no metric unit"
-    lengths = _solved_lengths(steps, solved)
+    values = solved.length, solved.relative_sigma, solved.relative_correlated_sigma
+    rows = zip(steps, np.transpose(values).tolist(), strict=True)
+    lengths = {ends: StepLength(*row) for ends, row in rows if np.isfinite(row[0])}
     contradicted = list(compress(steps, solved.contradicted))
     return Scale(mode, estimate, per_frame, lengths, named, contradicted)
 
@@ -195,9 +197,9 @@ def _absolute_lengths(
     road_steps: Mapping[Ends, RoadStep], unit: float, lidar_steps: Sequence[RelativePose]
 ) -> dict[Ends, tuple[float, float]]:
     """Lengths by the road, in ``unit`` a camera height, or by LiDAR, and their relative sigmas."""
-    absolute = {}
-    for ends, road in road_steps.items():
-        absolute[ends] = unit * road.length_heights, road.relative_sigma
+    absolute = {
+        ends: (unit * road.length_heights, road.relative_sigma) for ends, road in road_steps.items()
+    }
     for pose in lidar_steps:
         length = float(np.linalg.norm(pose.T_from_to[:3, 3]))
         if length > 0:
@@ -214,10 +216,8 @@ def _prior_unit(
 ) -> FloatArray:
     """The mode's unit per unscaled length near each frame ``(N,)``, before lengths are solved."""
     if isinstance(by_planes, Failed):
-        ratios = []
-        for ends, motion in motions.items():
-            if ends in absolute:
-                ratios.append(absolute[ends][0] / motion.length_unscaled)
+        both = motions.keys() & absolute.keys()
+        ratios = [absolute[ends][0] / motions[ends].length_unscaled for ends in both]
         return np.full(len(roads), float(np.median(ratios)) if ratios else 1.0)
     if absolute:
         # steps of known length measure the drift of the unit; rain or a car ahead biases the
@@ -226,26 +226,9 @@ def _prior_unit(
     return scale_track(roads, camera_height, by_planes)
 
 
-def _solved_lengths(steps: Sequence[Ends], solved: StepLengths) -> dict[Ends, StepLength]:
-    """The lengths that were measured."""
-    lengths = {}
-    for row, ends in enumerate(steps):
-        if np.isfinite(solved.length[row]):
-            lengths[ends] = StepLength(
-                float(solved.length[row]),
-                float(solved.relative_sigma[row]),
-                float(solved.relative_correlated_sigma[row]),
-            )
-    return lengths
-
-
-def _lengths(steps: Sequence[RelativePose]) -> dict[Ends, float]:
-    return {pose.ends: float(np.linalg.norm(pose.T_from_to[:3, 3])) for pose in steps}
-
-
 def height_by_lidar(lidar_steps: Sequence[RelativePose], drive: Drive) -> float | None:
     """The camera's height from steps measured by LiDAR and the road, or else by learned planes; None without both."""
-    metres = _lengths(lidar_steps)
+    metres = {pose.ends: float(np.linalg.norm(pose.T_from_to[:3, 3])) for pose in lidar_steps}
     roads = drive.road_steps
     heights = [metres[ends] / roads[ends].length_heights for ends in roads if ends in metres]
     if not heights:

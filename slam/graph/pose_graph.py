@@ -158,10 +158,8 @@ class PoseGraph:
         self.dropped += compress(self.relative_poses, is_wrong)
         self.relative_poses = list(compress(self.relative_poses, ~is_wrong))
         placed = (self.T_fixed_world @ T_world_camera)[:, :3, 3]
-        squared = []
-        for frame, position, own in self._positions:
-            squared.append(float((((placed[frame] - position) / own) ** 2).sum()))
-        is_stray = _outlying(np.array(squared))
+        away = [(placed[frame] - position) / own for frame, position, own in self._positions]
+        is_stray = _outlying(np.square(away).reshape(-1, 3).sum(axis=1))
         self._positions = list(compress(self._positions, ~is_stray))
         if is_stray.any():
             logger.warning(
@@ -192,9 +190,8 @@ class PoseGraph:
         Raises:
             SlamError: if the graph was not optimised.
         """
-        lines = []
-        for k, pose in enumerate(translations_and_quaternions(self._solution())):
-            lines.append(f"{_VERTEX} {k} {_numbers(pose)}")
+        poses = translations_and_quaternions(self._solution())
+        lines = [f"{_VERTEX} {k} {_numbers(pose)}" for k, pose in enumerate(poses)]
         T_from_to = np.array([edge.T_from_to for edge in self.relative_poses]).reshape(-1, 4, 4)
         measured = translations_and_quaternions(T_from_to)
         for edge, pose in zip(self.relative_poses, measured, strict=True):

@@ -93,10 +93,11 @@ def describe(grey: Grey, pixels: NDArray[np.floating[Any]]) -> Descriptors:
         return np.zeros((0, 32), np.uint8)
     # at half the size a quarter of the pixels describe the same surroundings
     half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    corners = []
-    for (u, v), angle in zip(pixels, _directions_deg(grey, pixels), strict=True):
-        x, y = 0.5 * float(u) - 0.25, 0.5 * float(v) - 0.25
-        corners.append(cv2.KeyPoint(x, y, _SIFT_SIZE_PX / 2, float(angle), 1.0, 0, 0))
+    places = (0.5 * pixels.astype(np.float64) - 0.25).tolist()
+    corners = [
+        cv2.KeyPoint(x, y, _SIFT_SIZE_PX / 2, float(angle))
+        for (x, y), angle in zip(places, _directions_deg(grey, pixels), strict=True)
+    ]
     _, values = cv2.SIFT.create().compute(half, corners)
     roots = np.sqrt(values / np.maximum(values.sum(axis=1, keepdims=True), 1e-9))
     return np.packbits(np.concatenate([roots > _LOW, roots > _HIGH], axis=1), axis=1)

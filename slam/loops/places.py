@@ -87,12 +87,9 @@ class Places:
             raise RunError(f"{path} has format {version}, this version reads {_FORMAT}: run again")
         width, height, *pinhole = content["camera"].tolist()
         frames, ends = content["frames"].tolist(), np.cumsum(content["counts"])
-        pixels = np.split(content["pixels"], ends)
-        descriptors = np.split(content["descriptors"], ends)
-        points = np.split(content["points"], ends)
-        views = []
-        for k, frame in enumerate(frames):  # the part after the last view is empty
-            views.append(View(frame, pixels[k], descriptors[k], points[k]))
+        # the part after the last view is empty
+        parts = (np.split(content[key], ends)[:-1] for key in ("pixels", "descriptors", "points"))
+        views = map(View, frames, *parts)
         camera = Intrinsics(int(width), int(height), *pinhole, undistorted=undistorted)
         return cls(camera, tuple(views), content["T_world_camera"])
 

@@ -149,10 +149,11 @@ class _Rows:
         """Each map after the first that loops join with an earlier one."""
         events = []
         for number, segment in enumerate(self.segments):
-            joining = []
-            for earlier, later in map(self.of, loops):
-                if self.maps[earlier] != number and self.maps[later] == number:
-                    joining.append(self.keyframes[earlier].index)
+            joining = [
+                self.keyframes[earlier].index
+                for earlier, later in map(self.of, loops)
+                if self.maps[earlier] != number and self.maps[later] == number
+            ]
             if joining:
                 first = segment.keyframes[0].index
                 events.append(TrackingEvent(first, "map joined", joining[0], len(joining)))

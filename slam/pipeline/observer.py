@@ -330,10 +330,8 @@ class Observer:
             self._tasks.append(Task("geometry", self._beside.submit(rotation), keep_rotation))
         if step is not None:
             first, motion = step
-            T_first_current = motion.relative_pose.T_from_to
-            measured = self._beside.submit(
-                self._road.measure, first, current.frame, T_first_current
-            )
+            arguments = first, current.frame, motion.relative_pose.T_from_to
+            measured = self._beside.submit(self._road.measure, *arguments)
             self._tasks.append(Task("road", measured, partial(self._keep_road, motion.ends)))
         if current.prediction is not None:
             self._tasks.append(
@@ -417,12 +415,10 @@ class Observer:
         """
         first, T_first_previous, between = apart
         wide = self._motion(first, current) if previous > first.frame.index else step
-        motions, since = self.drive.motions, current.frame.index - first.frame.index
-        if not isinstance(wide, Motion):
+        motions, frames = self.drive.motions, current.frame.index - first.frame.index
+        if not isinstance(wide, Motion) or wide.support < _LEAST_SEEN or frames > LONGEST_STEP:
             return first, step
         if not wide.is_triangulated:
-            if wide.support < _LEAST_SEEN or since > LONGEST_STEP:
-                return first, step
             pose = wide.relative_pose
             T_previous_current = invert(T_first_previous) @ pose.T_from_to
             by_first = replace(

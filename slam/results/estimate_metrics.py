@@ -275,10 +275,10 @@ def _depth_error(result: Estimate) -> list[dict[str, float | None]] | Failed:
     curve, unit = result.drive.depth_error.curve(), float(np.median(result.scale.per_frame))
     if not curve:
         return Failed("no step triangulated corners with learned depth")
-    errors: list[dict[str, float | None]] = []
-    for depth, bias, sigma, corners in curve:
-        errors.append({"depth": unit * depth, "bias": bias, "sigma": sigma, "corners": corners})
-    return errors
+    return [
+        {"depth": unit * depth, "bias": bias, "sigma": sigma, "corners": corners}
+        for depth, bias, sigma, corners in curve
+    ]
 
 
 def _gps(result: Estimate, in_graph: bool) -> records.GpsMetrics | Failed:

@@ -29,7 +29,9 @@ from slam.runtime.files import (
     MAP_MESH,
     MEANINGS,
     METRICS,
+    REFERENCE,
     REPORT,
+    TRAJECTORIES,
     trajectory_file,
     write_atomically,
 )
@@ -149,8 +151,13 @@ class RunFolder:
 
         Raises:
             TrajectoryError: the file is there and cannot be read.
+            RunError: no run has a trajectory of this name.
         """
         path = self.path / trajectory_file(name, "tum")
+        if path.name not in MEANINGS:
+            raise RunError(
+                f"no run has a trajectory {name}: give {', '.join([REFERENCE, *TRAJECTORIES])}"
+            )
         return read_trajectory(path, "tum") if path.exists() else None
 
     def mesh(self) -> Any:

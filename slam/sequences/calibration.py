@@ -6,6 +6,7 @@ what makes a fit no calibration is said.
 
 from __future__ import annotations
 
+import logging
 import re
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -24,6 +25,7 @@ from slam.sequences.images import ImageSource
 Pattern = Literal["chessboard", "charuco"]
 Model = Literal["opencv", "fisheye"]
 
+logger = logging.getLogger(__name__)
 _BOARD = re.compile(r"(\d+)x(\d+)")
 _FEWEST = 3  # corners along one side
 _LEAST_CHARUCO = 12  # corners of a view: more than a homography needs
@@ -107,8 +109,10 @@ def found_corners(grey: Grey, board: Board, detector: Any) -> tuple[FloatArray, 
     """
     corners_m = board.corners_m
     if detector is None:
-        size, normalised = (board.columns, board.rows), cv2.CALIB_CB_NORMALIZE_IMAGE
-        is_found, pixels = cv2.findChessboardCornersSB(grey, size, flags=normalised)
+        size = board.columns, board.rows
+        is_found, pixels = cv2.findChessboardCornersSB(
+            grey, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE
+        )
         return (_refined(grey, pixels, _WINDOW), corners_m) if is_found else None
     pixels, numbers, *_ = detector.detectBoard(grey)
     if numbers is None or len(numbers) < _LEAST_CHARUCO:
@@ -172,14 +176,16 @@ def find_views(images: ImageSource, board: Board, progress: Progress) -> list[Vi
         DataError, SequenceError: an image cannot be read.
     """
     detector = cv2.aruco.CharucoDetector(board.charuco()) if board.pattern == "charuco" else None
-    step = -(-len(images) // _MOST_SEARCHED)
-    frames = range(0, len(images), step)
+    frames = range(0, len(images), -(-len(images) // _MOST_SEARCHED))
     views = []
     for count, frame in enumerate(frames, start=1):
         grey = np.asarray(cv2.cvtColor(images.read(frame), cv2.COLOR_RGB2GRAY), np.uint8)
         found = found_corners(grey, board, detector)
-        if found is not None:
+        if found:
             views.append(_view(frame, grey, *found))
+        elif count == FEWEST_VIEWS and not views:
+            text = "none of %d images shows the whole %s so far: --board counts the corners between its squares"
+            logger.warning(text, count, board.describe())
         progress("images", count, len(frames))
     if len(views) < FEWEST_VIEWS:
         raise SlamError(

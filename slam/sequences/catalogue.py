@@ -70,6 +70,7 @@ _PIECES = {
     "images": (re.compile(r"(?P<head>)(?P<number>\d{3})(?P<tail>)"),),
 }
 _NAMED_TO_S = 1.5  # names give whole seconds
+_TRIP_S = 7200.0  # from the beginning of a clip to that of the next, before another trip begins
 _LONGEST_PAUSE = 3.0  # times the usual distance of two pieces, before another drive begins
 
 
@@ -292,11 +293,8 @@ def find_series(kinds: Mapping[str, str]) -> list[list[Piece]]:
             continue
         pieces.sort(key=lambda piece: piece.place)
         apart = np.diff([piece.place for piece in pieces])
-        cuts = [
-            0,
-            *(np.flatnonzero(apart > _LONGEST_PAUSE * np.median(apart)) + 1).tolist(),
-            len(pieces),
-        ]
+        longest = min(_LONGEST_PAUSE * np.median(apart), _TRIP_S)
+        cuts = [0, *(np.flatnonzero(apart > longest) + 1).tolist(), len(pieces)]
         found += [pieces[a:b] for a, b in pairwise(cuts) if b > a + 1]
     return found
 

@@ -101,7 +101,8 @@ class ImageFiles:
         if (height, width) != (self.height, self.width):
             raise SequenceError(
                 f"{path} is {width}x{height}, but {self._sized_by.name} is "
-                f"{self.width}x{self.height}: all images of a sequence need one size; resize or remove it"
+                f"{self.width}x{self.height}: all images of a sequence need one size; resize or remove it, "
+                "or, where it lies on its side, the orientation in its EXIF"
             )
         return image
 

@@ -282,12 +282,8 @@ def _fov_camera(path: Path, fps: float) -> CameraFile:
 
 def _open_seven_scenes(folder: Path, asked: Path | None) -> RecordedSequence:
     """With the camera that the data set publishes for all."""
-    numbers = []
-    for path in folder.iterdir():
-        match = _SEVEN_SCENES_IMAGE.fullmatch(path.name)
-        if match is not None:
-            numbers.append(int(match[1]))
-    numbers.sort()
+    named = (_SEVEN_SCENES_IMAGE.fullmatch(path.name) for path in folder.iterdir())
+    numbers = sorted(int(match[1]) for match in named if match)
     if not numbers:
         raise SequenceError(f"no frame-NNNNNN.color.png in {folder}: unpack the sequence")
     frames = [folder / f"frame-{k:06d}" for k in range(numbers[0], numbers[-1] + 1)]

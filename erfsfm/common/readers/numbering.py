@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
 
+_DIGITS = re.compile(r"\d+")
 _NUMBERED = re.compile(r"(?P<prefix>.*?)(?P<number>\d+)")
 
 
@@ -101,7 +102,20 @@ def by_name(paths: list[Path]) -> NumberedFiles:
     """A user's files, at least one, in order: gaps are detected where names end in numbers that go up one by one.
 
     Names without a number at their end, stamps and every-n-th-frame numbering have no gaps.
+
+    Raises:
+        DataError: many images share their number with another: depth, masks or another camera lie among them.
     """
+    by_digits: dict[tuple[str, ...], list[Path]] = {}
+    for path in paths:
+        by_digits.setdefault(tuple(_DIGITS.findall(path.stem)), []).append(path)
+    twins = [same for same in by_digits.values() if len(same) > 1]
+    if len(twins) > len(paths) / 4:
+        names = " and ".join(path.name for path in twins[0][:2])
+        raise DataError(
+            f"{paths[0].parent} has several images of one number, such as {names}: masks, depth and other cameras "
+            "go into folders of their own"
+        )
     numbers: list[int] = []
     prefixes: set[str] = set()
     for path in paths:

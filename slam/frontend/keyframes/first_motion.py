@@ -71,10 +71,10 @@ def first_motion(
         np.full(2 * len(rows), DEPTH_SIGMA),
     )
     problem = BundleAdjustment(sightings, intrinsics, np.array([False, True]))
-    solved = []
-    for T, z in starts:
-        poses = np.stack([np.eye(4), T])
-        solved.append(problem.solve(poses, rays_before * z[:, None], *_LIMITS))
+    solved = [
+        problem.solve(np.stack([np.eye(4), T]), rays_before * z[:, None], *_LIMITS)
+        for T, z in starts
+    ]
     costs = np.array([adjusted.cost for adjusted in solved])
     best = solved[int(np.argmin(costs))] if costs.min() < costs[0] - _GAIN else solved[0]
     return best.T_camera_world[1], best.points[:, 2]

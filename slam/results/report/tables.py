@@ -50,11 +50,8 @@ def key_numbers(metrics: Metrics, has_map: bool) -> list[tuple[str, str, str]]:
         ("Loops accepted", metrics.loops.accepted, 0, ""),
         ("Map triangles", metrics.map.triangles if has_map else None, 0, ""),
     ]
-    known = []
-    for name, value, decimals, unit in wanted:
-        if value is not None:
-            known.append((name, number(value, decimals), unit))
-    return known
+    known = (tile for tile in wanted if tile[1] is not None)
+    return [(name, number(value, decimals), unit) for name, value, decimals, unit in known]
 
 
 def what_ran(metrics: Metrics) -> Table:
@@ -108,9 +105,10 @@ def map_errors(metrics: Metrics) -> Table | None:
     rings = found.with_scale.by_distance if found.by_distance is None else found.by_distance
     for ring in rings or ():
         rows[f"{ring.from_m:.0f} to {ring.to_m:.0f} m from the camera"] = ring
-    texts = []
-    for name, each in rows.items():
-        texts.append([name, *(number(each.at(path)[0], 3) for path in _MAP_ERRORS.values())])
+    texts = [
+        [name, *(number(each.at(path)[0], 3) for path in _MAP_ERRORS.values())]
+        for name, each in rows.items()
+    ]
     truth, length = _TRUTHS.get(found.truth, found.truth), number(found.evaluated_m)
     note = (
         f"Against {truth}, {length} m of the path. Map where no surface was measured is an error."
@@ -125,13 +123,13 @@ def timing(metrics: Metrics) -> Table | None:
         return None
     timed = sum(stages.values())
     total = max(metrics.timing.seconds_total or 0.0, timed, 1e-9)
-    shares = {}
-    for name, seconds in (stages | {"between stages": total - timed}).items():
-        shares[name] = seconds / total
-    rows = []
-    for name, share in sorted(shares.items(), key=lambda item: -item[1]):
-        if share >= _LEAST_SHARE:
-            rows.append([name, f"{share * total:.1f}", f"{share:.0%}"])
+    spent = stages | {"between stages": total - timed}
+    longest = sorted(spent.items(), key=lambda item: -item[1])
+    rows = [
+        [name, f"{seconds:.1f}", f"{seconds / total:.0%}"]
+        for name, seconds in longest
+        if seconds >= _LEAST_SHARE * total
+    ]
     memory = number(metrics.timing.peak_rss_mb)
     processor = number(metrics.timing.cpu_seconds)
     note = f"{total:.1f} s in all, {processor} s of processor time, at most {memory} MiB of memory."

@@ -79,3 +79,29 @@ def raising(error: Exception) -> Callable[[object], object]:
 def test_every_error_is_one_line(outcome: Outcome, error: Exception, line: str) -> None:
     code, err = outcome(raising(error))
     assert code == 1 and err.startswith(line) and len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("option", "said"), [("-q", ""), ("-v", "fine odd"), ("--quiet", ""), (None, "odd")]
+)
+def test_how_much_is_said_on_the_terminal(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    option: str | None,
+    said: str,
+) -> None:
+    app = command_line.application("program", "It speaks.")
+
+    @app.command()
+    def speak() -> None:
+        logging.getLogger("program").info("fine")
+        logging.getLogger("program").warning("odd")
+
+    root = logging.getLogger()
+    monkeypatch.setattr(root, "handlers", [])
+    monkeypatch.setattr(root, "level", root.level)
+    monkeypatch.setattr(sys, "argv", ["program", *([option] if option else []), "speak"])
+    with pytest.raises(SystemExit):
+        command_line.run(app, "program", logging.WARNING)
+    lines = capsys.readouterr().err.splitlines()
+    assert " ".join(line.rpartition(": ")[2] for line in lines) == said

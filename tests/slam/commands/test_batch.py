@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 
+from slam.commands import batch
 from slam.commands.batch import (
     Drive,
     Outcome,
@@ -27,6 +28,7 @@ from slam.commands.batch import (
     spread,
 )
 from slam.commands.cli import main
+from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
 
 CommandLine = Callable[..., tuple[int, str, str]]
@@ -108,6 +110,28 @@ def test_sequences_of_a_data_set(kitti_root: Path) -> None:
         drives_of(kitti_root, ["12"], [])
     with pytest.raises(SequenceError, match=r"no manifest .*none\.csv: check the path"):
         drives_of(kitti_root / "none.csv", ["all"], [])
+
+
+def test_a_later_batch_adds_its_drives_to_those_of_earlier_ones(
+    tmp_path: Path, make_run: Callable[..., RunFolder], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A drive that is named again has the row of the later batch; rows of runs say how far to trust them."""
+    whole = make_run()
+
+    def ended(drive: Drive, output: Path, **_: object) -> Outcome:
+        status = "whole" if drive.name == "c" else "failed"
+        return Outcome(drive, whole.path, status, f"in {drive.arguments[0]}")
+
+    monkeypatch.setattr(batch, "run_drive", ended)
+    for names, folder in ("ab", "monday"), ("bc", "tuesday"):
+        drives = [Drive(name, tmp_path, (folder,)) for name in names]
+        run_drives(drives, tmp_path / "out", 1, None, silent)
+    with (tmp_path / "out/drives.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    reasons = [(row["drive"], row["reason"]) for row in rows]
+    assert reasons == [("a", "in monday"), ("b", "in tuesday"), ("c", "in tuesday")]
+    assert "% too short" in rows[2]["doubts"] and not rows[0]["doubts"]
+    assert {"confidence", "path", "mean_speed", "top_speed"} <= rows[2].keys()
 
 
 @pytest.mark.slow

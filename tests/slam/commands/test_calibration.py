@@ -17,11 +17,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from erfsfm.common.progress import silent
 from erfsfm.common.readers.camera_file import CameraFile, read_camera_file
 from slam.commands.cli import main
 from slam.frames import Intrinsics
-from slam.sequences.calibration import Board
+from slam.runtime.errors import SlamError
+from slam.sequences.calibration import Board, find_views
 from slam.sequences.catalogue import open_sequence
+from slam.sequences.images import ReadImages
 
 Call = Callable[..., tuple[int, str, str]]
 FISHEYE = {"model": "fisheye", "distortion": (-0.02, 0.01, -0.003, 0.0005)}
@@ -267,3 +270,14 @@ def test_what_does_not_determine_the_camera_is_refused(
     assert len(err.splitlines()) == 1
     assert re.search(message, err), err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["board"]
+
+
+def test_after_some_images_without_the_board_it_is_said_what_is_looked_for(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """A search of 300 images takes minutes, and the board may have been counted by its squares."""
+    images = ReadImages(80, 60, 12, lambda index: np.full((60, 80, 3), 20 * index, np.uint8))
+    with pytest.raises(SlamError, match="0 of 12 images show"):
+        find_views(images, Board(10, 7), silent)
+    (said,) = caplog.messages
+    assert "none of 8 images shows the whole 10x7 chessboard" in said and "corners between" in said

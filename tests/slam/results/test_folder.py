@@ -153,3 +153,13 @@ def test_lines_from_before_the_folder_are_kept_and_failures_are_written_here_alo
         "INFO slam.commands.run: 9 times: no road",
     ]
     assert "no space" not in caplog.text
+
+
+def test_a_trajectory_by_a_name_that_there_is_not_is_told_which_there_are(
+    make_run: Callable[..., RunFolder],
+) -> None:
+    with pytest.raises(
+        RunError, match=r"trajectory optimized: give reference, network, .*optimised"
+    ):
+        make_run().trajectory("optimized")
+    assert make_run("other").trajectory("lidar") is None

@@ -137,6 +137,14 @@ def test_files_named_by_their_time(trip: Path) -> None:
     np.testing.assert_allclose(np.diff(sequence.stamps)[[19, 39, 59]], [0.1, 0.1, 2.1], atol=1e-6)
 
 
+def test_two_trips_of_a_day_are_two_recordings(trip: Path) -> None:
+    for k, hour in enumerate((8, 18)):
+        write_clip(trip / f"20240101_{hour:02d}0000_F.avi", 20 * k)
+    assert sorted(sequence_kinds(trip)) == ["20240101_080000_F", "20240101_180000_F"]
+    later = open_sequence(trip, "20240101_180000_F")
+    np.testing.assert_allclose(shown(later), range(20, 40), atol=2)
+
+
 def test_clips_named_by_the_minute_that_are_shorter(
     trip: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from erfsfm.common.readers.numbering import by_number
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.numbering import by_name, by_number
 
 
 def named(*stems: str) -> list[Path]:
@@ -45,3 +46,12 @@ def test_rows_of_accompanying_files(
     assert (None if assigned is None else (assigned[0].tolist(), assigned[1])) == (
         None if rows is None else (rows, skipped)
     )
+
+
+@pytest.mark.parametrize("twin", ["{}_mask", "depth{}", "{}_right"])
+def test_images_of_two_kinds_in_one_folder_are_named(twin: str) -> None:
+    stems = [f"{k:04d}" for k in range(8)]
+    both = [stem for k in stems for stem in (k + "_left" * ("right" in twin), twin.format(k))]
+    with pytest.raises(DataError, match=r"several images of one number, such as 0000.* and .*0000"):
+        by_name(named(*both))
+    assert len(by_name(named("run1_a", "run1_b", "run1_c", "run1_d", "run1_e"))) == 5

@@ -141,7 +141,9 @@ def train_fusion(
     samples: Annotated[
         int, typer.Option(min=8, help="to draw; a thousand takes 0.7 GB of memory")
     ] = 4000,
-    steps: Annotated[int, typer.Option(min=1, help="of optimisation")] = 6000,
+    steps: Annotated[
+        int, typer.Option(min=0, help="of optimisation; 0 fits the sigma alone")
+    ] = 6000,
     start: Annotated[
         str | None, typer.Option(help="begin with the network of default, or an output folder")
     ] = None,

@@ -223,7 +223,7 @@ def _optimise(
 
     def rate(step: int) -> float:
         return min(1, (step + 1) / _WARM_UP) * max(
-            _LEAST_RATE, (1 + math.cos(math.pi * step / steps)) / 2
+            _LEAST_RATE, (1 + math.cos(math.pi * step / max(steps, 1))) / 2
         )
 
     schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, rate)

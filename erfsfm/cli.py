@@ -156,9 +156,9 @@ def train_fusion(
     """
     from erfsfm.training.fusion import train_fusion as run_training
 
-    told = samples, steps, seed, _command()
+    told = (weights, start), samples, steps, seed, _command()
     with progress_bar() as progress:
-        metrics = run_training(dataset, validation, output, weights, *told, progress, start)
+        metrics = run_training(dataset, validation, output, *told, progress)
     print_rows([metrics], as_json)
     if not as_json:
         typer.echo(f"network in {output}: use it with --set depth.fusion={output}")

@@ -141,7 +141,9 @@ def train_fusion(
     samples: Annotated[
         int, typer.Option(min=8, help="to draw; a thousand takes 0.7 GB of memory")
     ] = 4000,
-    steps: Annotated[int, typer.Option(min=1, help="of optimisation")] = 6000,
+    steps: Annotated[
+        int, typer.Option(min=0, help="of optimisation; 0 fits the sigma alone")
+    ] = 6000,
     start: Annotated[
         str | None, typer.Option(help="begin with the network of default, or an output folder")
     ] = None,
@@ -154,9 +156,9 @@ def train_fusion(
     """
     from erfsfm.training.fusion import train_fusion as run_training
 
-    told = samples, steps, seed, _command()
+    told = (weights, start), samples, steps, seed, _command()
     with progress_bar() as progress:
-        metrics = run_training(dataset, validation, output, weights, *told, progress, start)
+        metrics = run_training(dataset, validation, output, *told, progress)
     print_rows([metrics], as_json)
     if not as_json:
         typer.echo(f"network in {output}: use it with --set depth.fusion={output}")

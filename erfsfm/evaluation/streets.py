@@ -29,6 +29,7 @@ TRUTH = "truth"
 MOVING = "moving"  # masks of the same names as the truth, not 0 where something moves
 CAMERAS = "calib"  # a text a pair: fx fy cx cy of its image, pixels
 PARTS = "static", "moving"
+PER_METRE = 256.0  # value of a metre in a depth map
 
 Image = NDArray[np.uint8]
 Depth = NDArray[np.float32]
@@ -97,19 +98,22 @@ def _laid_out(root: Path, street: str, folder: Path, part: str) -> list[str]:
     sequence = folder / "sequences" / "00"
     for name in ("image_2", "depth_2"):
         (sequence / name).mkdir(parents=True)
-    camera = np.zeros(6)
     for image in list_images(root / IMAGES):
         before, _, number = image.stem.rpartition("_")
         truth, moving = (root / each / f"{image.stem}.png" for each in (TRUTH, MOVING))
         if before != street or not truth.is_file():
             continue
         (sequence / "image_2" / f"{number}{image.suffix}").symlink_to(image.resolve())
-        depth = cv2.imread(str(truth), cv2.IMREAD_UNCHANGED)
+        depth = read_depth_map(truth)
         if part:
-            depth[(cv2.imread(str(moving), cv2.IMREAD_GRAYSCALE) > 0) != (part == PARTS[1])] = 0
-        cv2.imwrite(str(sequence / "depth_2" / f"{number}.png"), depth)
-        camera = np.array(read_text(root / CAMERAS / f"{image.stem}.txt").split(), float)
-    fx, fy, cx, cy = camera[:4]
+            depth[(read_image(moving)[..., 0] > 0) != (part == PARTS[1])] = 0
+        written = np.round(depth * PER_METRE).astype(np.uint16)
+        cv2.imwrite(str(sequence / "depth_2" / f"{number}.png"), written)
+        file = root / CAMERAS / f"{image.stem}.txt"
+        try:
+            fx, fy, cx, cy = map(float, read_text(file).split()[:4])
+        except (OSError, ValueError) as error:
+            raise DataError(f"{file} must hold fx fy cx cy of its image: {error}") from error
     (sequence / "calib.txt").write_text(f"P2: {fx} 0 {cx} 0 0 {fy} {cy} 0 0 0 1 0\n")
     return ["--dataset", str(folder)]
 

@@ -131,13 +131,12 @@ def train_fusion(
     datasets: Sequence[Path],
     validation: Sequence[Path],
     output: Path,
-    weights: str,
+    networks: tuple[str, str | None],
     samples: int,
     steps: int,
     seed: int,
     command: str,
     progress: Progress,
-    start: str | None = None,
 ) -> dict[str, float]:
     """Train on simulated worlds, write ``fusion.onnx`` and a record; returns the errors on the validation's worlds.
 
@@ -145,16 +144,16 @@ def train_fusion(
         datasets: roots with depth maps and poses.
         validation: such roots, not trained on, which also fit the sigma.
         output: receives the files.
-        weights: of the network that guesses depth.
+        networks: weights of the one that guesses depth; and the one to begin with, as `DepthFusion` names it, None for
+            a fresh one.
         samples: to draw; a thousand takes 0.7 GB of memory.
         steps: of optimisation, with batches of eight.
         seed: of everything drawn.
         command: for the record.
         progress: is told.
-        start: the network to begin with, as `DepthFusion` names it, instead of a fresh one.
 
     Raises:
-        CheckpointError: there is no such network.
+        CheckpointError: there is no such network to begin with.
         TrainingError: data without depth or poses, or a file of another program in the way.
     """
     assert STEP == 2**LEVELS, "evidence is padded for another network"
@@ -164,6 +163,7 @@ def train_fusion(
             f"{output / FILE} is not of train-fusion and would be replaced: choose another --output"
         )
     output.mkdir(parents=True, exist_ok=True)
+    weights, start = networks
     net = FusionNet(CHANNELS, 4 * CHANGE)
     if start is not None:
         net.begin_with(DepthFusion(start).path)
@@ -223,7 +223,7 @@ def _optimise(
 
     def rate(step: int) -> float:
         return min(1, (step + 1) / _WARM_UP) * max(
-            _LEAST_RATE, (1 + math.cos(math.pi * step / steps)) / 2
+            _LEAST_RATE, (1 + math.cos(math.pi * step / max(steps, 1))) / 2
         )
 
     schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, rate)

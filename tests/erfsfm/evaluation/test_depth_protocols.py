@@ -95,6 +95,9 @@ def test_refined_depth_of_pairs_with_masks(tmp_path: Path, monkeypatch: pytest.M
     assert names == ["a", "a static", "a moving"]
     assert [row["refined"] for row in rows] == [1.0, 0.75, 0.25]
     assert (mean["streets"], mean["refined"], mean["learned"]) == (1, 1.0, 0.5)
+    (tmp_path / "calib" / "b_000000.txt").write_text("30 30")
+    with pytest.raises(DataError, match=r"b_000000\.txt must hold fx fy cx cy"):
+        refined_protocol(Flat(), "default", [tmp_path], allow_leak=False)
 
 
 def test_depth_of_a_pack(

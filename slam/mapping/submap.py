@@ -314,9 +314,7 @@ def moved_rows(T_world_camera: FloatArray, step_m: float, turn_deg: float) -> li
     return chosen
 
 
-def _outwards(
-    u: NDArray[np.floating[Any]], v: NDArray[np.floating[Any]], shape: tuple[int, ...]
-) -> FloatArray:
+def _outwards(u: NDArray[Any], v: NDArray[Any], shape: tuple[int, ...]) -> FloatArray:
     """Squared distance of pixels ``(M,)`` from the middle of an image ``(h, w)``, in half its width."""
     height, width = shape[:2]
     x, y = 2.0 * u - width + 1.0, 2.0 * v - height + 1.0

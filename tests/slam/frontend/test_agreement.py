@@ -151,7 +151,8 @@ def test_a_guessed_focal_length_comes_with_the_one_that_corners_show() -> None:
     said = agreement.of_focal_length(found, guess)
     assert said is not None
     assert f"{100 * CAMERA.fx / 300.0:.0f} % of the given" in said.figure
-    assert "--camera auto" in said.figure
+    calibrated = agreement.of_focal_length(found, replace(guess, focal_sigma=0.0))
+    assert calibrated is not None and "--camera auto" in calibrated.figure
 
 
 def test_a_focal_length_that_nothing_measured_speaks_for_no_camera() -> None:

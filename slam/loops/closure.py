@@ -267,20 +267,19 @@ class Track:
     """Odometry ``T_world_camera`` ``(N, 4, 4)`` row by row: of the frames of a drive, or of the keyframes of its maps.
 
     ``path`` ``(N,)`` grows by what odometry may err on. Lengths have one unit within each of
-    ``maps`` ``(N,)``, and maps that odometry relates have one of ``worlds`` ``(N,)``.
+    ``maps`` ``(N,)``.
     """
 
     T_world_camera: FloatArray
     path: FloatArray
     frames: NDArray[np.intp]
     maps: NDArray[np.intp]
-    worlds: NDArray[np.intp]
 
     @classmethod
     def of_drive(cls, T_world_camera: FloatArray) -> Self:
         """Of all frames of a drive, in one unit."""
         frames, one = np.arange(len(T_world_camera)), np.zeros(len(T_world_camera), np.intp)
-        return cls(T_world_camera, path_distance(T_world_camera), frames, one, one)
+        return cls(T_world_camera, path_distance(T_world_camera), frames, one)
 
     def rows(self, loops: Sequence[Loop]) -> NDArray[np.intp]:
         """Rows of both ends of loops ``(L, 2)``."""
@@ -301,20 +300,19 @@ def agreeing(
     """
     limit = f"{thresholds.max_drift_ratio:.0%}"
     too_far = f"corrects the odometry by more than {limit} of the path between its frames"
-    possible: list[Loop] = []
-    doubtful: list[bool] = []
+    possible, doubtful = [], []
     kept: list[Loop] = []
     refused: list[RejectedLoop] = []
     for loop, (earlier, later) in zip(loops, track.rows(loops), strict=True):
         T_earlier_later = invert(track.T_world_camera[earlier]) @ track.T_world_camera[later]
         drift = np.linalg.norm((T_earlier_later - loop.measured.T_from_to)[:3, 3])
         length = track.path[later] - track.path[earlier]
-        is_far = bool(drift > thresholds.max_drift_ratio * length)
+        is_far = drift > thresholds.max_drift_ratio * length
         if is_far and track.maps[earlier] == track.maps[later]:
             refused.append(loop.refused(too_far))
         else:
             possible.append(loop)
-            doubtful.append(is_far and track.worlds[earlier] == track.worlds[later])
+            doubtful.append(is_far)
     for loop, is_doubtful, (supporting, conflicting) in zip(
         possible, doubtful, _votes_by_maps(possible, track, thresholds), strict=True
     ):

@@ -236,10 +236,16 @@ def matches(
     first: View, second: View, thresholds: LoopThresholds
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows of mutual nearest neighbours by Hamming distance that pass Lowe's ratio test."""
-    if min(len(first), len(second)) < 2:
+    return mutual(hamming(first.descriptors, second.descriptors), thresholds)
+
+
+def mutual(
+    distance: NDArray[np.float32], thresholds: LoopThresholds
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The same by distances ``(M, N)``, infinite where two may not match."""
+    if min(distance.shape) < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    distance = hamming(first.descriptors, second.descriptors)
-    rows, nearest = np.arange(len(first)), distance.argmin(axis=1)
+    rows, nearest = np.arange(len(distance)), distance.argmin(axis=1)
     best = distance[rows, nearest]
     kept = (distance.argmin(axis=0)[nearest] == rows) & (best <= thresholds.max_hamming)
     distance[rows, nearest] = np.inf

@@ -33,8 +33,8 @@ _LEAST_KEPT = 0.5
 # of neighbouring keyframes: rotation, translation over the step, logarithm of the scale
 _ROTATION_SIGMA, _RELATIVE_SIGMA, _SCALE_SIGMA = 0.005, 0.03, 0.02
 _LEAST_SIGMA = 1e-4
+_UNRELATED = 1e9  # length by which odometry may err between maps that no motion relates
 _LOOP_SCALE_SIGMA = 0.05  # of the logarithm of the ratio of two units by a loop
-_TURN_SIGMAS = 3.0  # of a motion between parts of a map, by which a loop may correct it
 
 
 @dataclass(frozen=True)
@@ -103,19 +103,13 @@ class _Rows:
         self.T_map_camera = np.concatenate([segment.T_world_camera for segment in maps])
         # where odometry has the keyframes: parts of a map are related by the motions between them
         frames = np.array([keyframe.index for keyframe in self.keyframes], np.intp)
-        alone = zip(frames.tolist(), (-1 - self.maps).tolist(), strict=True)
-        worlds = np.array([poses.component.get(frame, world) for frame, world in alone], np.intp)
-        related = worlds >= 0
-        T = self.T_map_camera.copy()
-        T[related] = np.array([poses.T_map_camera[k] for k in frames[related].tolist()]).reshape(
-            -1, 4, 4
-        )
-        path = path_distance(T)
-        for pose in poses.poses:
-            if poses.segments[pose.from_index] != poses.segments.get(pose.to_index):
-                unsure = _TURN_SIGMAS * float(np.linalg.norm(pose.sigmas[3:]))
-                path[frames >= pose.to_index] += unsure / OF_KEYFRAMES.max_drift_ratio
-        self.track = Track(T, path, frames, self.maps, worlds)
+        T, worlds = [], []
+        for k, number, own in zip(frames.tolist(), self.maps, self.T_map_camera, strict=True):
+            T.append(poses.T_map_camera.get(k, own))
+            worlds.append(poses.component.get(k, number))
+        T_world_camera = np.array(T)
+        path = path_distance(T_world_camera) + _UNRELATED * np.array(worlds)
+        self.track = Track(T_world_camera, path, frames, self.maps)
 
     def of(self, loop: Loop) -> tuple[int, int]:
         """Rows of the keyframes of a loop."""

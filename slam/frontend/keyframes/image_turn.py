@@ -163,9 +163,7 @@ def _local_contrast(image: SmallImage, sigma: float) -> SmallImage:
     )
 
 
-def turned(
-    pixels: NDArray[np.float32], R_now_before: FloatArray, intrinsics: Intrinsics
-) -> NDArray[np.float32]:
+def turned(pixels: Pixels | FloatArray, R_now_before: FloatArray, intrinsics: Intrinsics) -> Pixels:
     """Where pixels ``(M, 2)`` of the last image are after a turn; those behind the camera stay."""
     rays = intrinsics.rays(pixels.astype(np.float64)) @ R_now_before.T
     ahead = rays[:, 2] > 0.1

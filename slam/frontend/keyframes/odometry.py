@@ -40,7 +40,8 @@ from slam.frontend.keyframes.relocalisation import Relocaliser
 from slam.frontend.tracking import KEYFRAME_SEARCH, Pixels, are_inside, new_corners, track
 from slam.geometry.multiview import INLIER_PX, MIN_POINTS, Resection, parallax_px, resect
 from slam.geometry.se3 import FloatArray, apply, compose, invert, make
-from slam.loops.features import describe
+from slam.loops.features import describe, hamming
+from slam.loops.verification import OF_KEYFRAMES, mutual
 
 logger = logging.getLogger(__name__)
 
@@ -50,7 +51,7 @@ _MOST_FLOW = 4.0
 _LEAST_SHIFT_PX = 16.0  # smaller ones flow finds by itself
 # of turned images, for a guess, and for a measurement
 _LEAST_CORRELATION = 0.4
-_SURE_CORRELATION = 0.8
+_SURE_CORRELATION = 0.82
 _KEYFRAME_TRACKS_RATIO = 0.25  # ratio of a keyframe's corners still tracked that asks for another
 # seconds without a pose after which a new map is begun, the next frame's included
 _MAX_LOST_S = 0.35
@@ -63,6 +64,7 @@ _YOUNG_KEYFRAMES = 4
 _DOUBTFUL_PARALLAX_RATIO = 0.005
 _LOOKED_BACK = 4  # keyframes between which points have parallax before a first motion
 _MAX_CORNERS = 500  # of a keyframe
+_MATCHED_RATIO = 0.125  # within which descriptors match where flow fails, over the image width
 _NOTHING: tuple[TrackIds, Pixels] = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
 
 
@@ -169,8 +171,11 @@ class KeyframeOdometry:
         if self._locate(segment, frame, track_ids, pixels):
             return
         turn = image_turn(*images) if turn is None else turn
+        is_sure = turn.correlation > _SURE_CORRELATION and not self._lost
+        if not is_sure and self._locate(segment, frame, *self._matched(segment, frame, turn)):
+            return
         self._T_last_step = make(turn.R_now_before, np.zeros(3))
-        if turn.correlation > _SURE_CORRELATION and not self._lost:
+        if is_sure:
             self._T_camera_world = compose(self._T_last_step, self._T_camera_world)
             self._add_keyframe(segment, frame, *_NOTHING)
             segment.frames.append(TrackedFrame(frame.index, *_NOTHING, self._T_camera_world))
@@ -229,6 +234,18 @@ class KeyframeOdometry:
         self._places[rows] = np.where(kept[:, None], tracked, guesses + shift)
         return keyframe.track_ids[rows[kept]], tracked[kept]
 
+    def _matched(self, segment: LocalMap, frame: Frame, turn: ImageTurn) -> tuple[TrackIds, Pixels]:
+        """Corners of the last keyframe found by descriptors, near where the turn of the image moves them."""
+        keyframe = segment.keyframes[-1]
+        R_before_keyframe = self._T_camera_world[:3, :3] @ keyframe.T_camera_world[:3, :3].T
+        guesses = turned(keyframe.places, turn.R_now_before @ R_before_keyframe, self._intrinsics)
+        corners = new_corners(frame, _NOTHING[1], _MAX_CORNERS)
+        distance = hamming(keyframe.descriptors, describe(frame.grey, corners))
+        apart = np.linalg.norm(guesses[:, None] - corners, axis=2)
+        distance[apart > _MATCHED_RATIO * self._intrinsics.width] = np.inf
+        rows, found = mutual(distance, OF_KEYFRAMES)
+        return keyframe.track_ids[rows], corners[found]
+
     def _locate(self, segment: LocalMap, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> bool:
         """The camera's pose from known points; whether there are enough."""
         known = segment.known(track_ids)
@@ -285,7 +302,7 @@ class KeyframeOdometry:
         rows = np.searchsorted(before.track_ids, track_ids)
         known = segment.known(track_ids)
         settled = segment.parallax(segment.keyframes[-_LOOKED_BACK:]).settled[track_ids]
-        if settled.sum() >= MIN_POINTS or known.sum() < MIN_POINTS:
+        if settled.sum() >= MIN_POINTS:
             return
         tracks = track_ids[known]
         pixels_before = before.pixels[rows[known]]

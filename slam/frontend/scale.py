@@ -30,7 +30,7 @@ from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.road import RoadStep
 from slam.frontend.visual.motion import Motion, links, triangulated
-from slam.geometry.robust import mad_sigma, running_median
+from slam.geometry.robust import mad_sigma, median, running_median
 from slam.geometry.se3 import FloatArray, path_distance
 from slam.runtime.errors import Failed, SlamError
 
@@ -397,8 +397,8 @@ class StepEvidence:
             camera_height: in the mode's unit.
         """
         log_speed = running_median(log_length - np.log(self.seconds), _SPEED_STEPS)
-        usual = np.nanmedian(log_speed) if np.isfinite(log_speed).any() else np.nan
-        speed = np.exp(np.where(np.isfinite(log_speed), log_speed, usual))
+        is_known = np.isfinite(log_speed)
+        speed = np.exp(np.where(is_known, log_speed, median(log_speed[is_known])))
         duration = 0.5 * (self.seconds[1:] + self.seconds[:-1])
         change = _ACCELERATION_SIGMA * camera_height * duration
         return np.asarray(change / np.maximum(speed[1:], speed[:-1]))
@@ -509,9 +509,10 @@ def solve_lengths(evidence: StepEvidence, camera_height: float = 1.0) -> StepLen
         speed_sigma = evidence.steady_sigma(state[lengths], camera_height)
         sigma[of_speed] = np.where(known[of_speed], speed_sigma, np.inf)
         residual = np.abs((state[plus] - state[minus] - value) / sigma)
-        huber = 1.0 / np.maximum(residual / _HUBER_K, 1.0)
-        cauchy = 1.0 / (1.0 + (residual / OUTLIER_SIGMAS) ** 2)
-        weights = np.where(iteration < _HUBER_ITERATIONS, huber, cauchy)
+        if iteration < _HUBER_ITERATIONS:
+            weights = 1.0 / np.maximum(residual / _HUBER_K, 1.0)
+        else:
+            weights = 1.0 / (1.0 + (residual / OUTLIER_SIGMAS) ** 2)
         weights[is_bound] = 1.0
     log_length, log_unit = state[lengths], state[units]
     of_measured = np.where(measured[lengths], 1.0, np.nan)

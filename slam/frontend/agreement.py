@@ -7,6 +7,7 @@ from both.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -232,7 +233,9 @@ def of_images(
     if needs_road and steps and too_far is not None:
         figure = f"it is up to {100 * np.expm1(too_far):.0f} % farther than triangulated, as where a lens zooms"
         compared("learned depth far away", too_far / _FAR_SPREAD, figure)
-    agreements += filter(None, [of_focal_length(drive.focal_length, camera)])
+    by_corners = of_focal_length(drive.focal_length, camera)
+    if by_corners is not None:
+        agreements.append(by_corners)
     for each in agreements[1:]:  # gaps and segments were said by their frames
         each.said()
     return agreements
@@ -253,7 +256,7 @@ def _overlap(support: FloatArray) -> tuple[float, str]:
 def of_focal_length(found: FocalLength, camera: Intrinsics) -> Agreement | None:
     """By the focal length that corners show; None where they show too little. A rough guess is a doubt in any case."""
     logarithm, sigma = found.error or (0.0, np.inf)
-    sigmas = abs(logarithm) / float(np.hypot(np.hypot(_FOCAL, sigma), camera.focal_sigma))
+    sigmas = abs(logarithm) / math.hypot(_FOCAL, sigma, camera.focal_sigma)
     is_guess = camera.focal_sigma > SURE
     figure = "nobody calibrated it" if is_guess else ""
     if sigma < _TELLING_FOCAL or (sigmas > DOUBTFUL and not is_guess):

@@ -97,8 +97,8 @@ class Drive:
         ``repeated`` frames with the image of the one before, ``moving`` those of them just before
         which the camera moved. ``depth_error`` is that of learned depth and ``focal_length`` the
         one that corners show, as the steps have them. ``maps`` are those of keyframes and
-        ``events`` what became of them; a drive measured by steps alone has none. ``fixed`` is the part of the
-        last image that is fixed to the camera.
+        ``events`` what became of them; a drive measured by steps alone has none. ``fixed`` is the
+        part of the last image that is fixed to the camera.
 
     Added by `slam.frontend.completion.complete_drive`, which also leaves out views and keyframes of
     interpolated frames, fills ``snippets`` to one a target, and smooths the rotations of

@@ -96,8 +96,9 @@ class GpsFixes:
 
         Errors of fixes lengthen a chord by about their variance over its length. So chords are a
         tenth of the fixes, or several of them where these span less than 20 sigmas, and are chosen
-        by the camera's lengths: choosing by GPS would prefer chords that errors lengthen. Speeds of the receiver, which
-        do not share the errors of its places, give the lengths where it states them.
+        by the camera's lengths: choosing by GPS would prefer chords that errors lengthen. Speeds of
+        the receiver, which do not share the errors of its places, give the lengths where it states
+        them.
         """
         if (found := self._by_speeds(T_world_camera_unscaled)) is not None:
             return found

@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 from erfsfm.common.processes import limit_library_threads
 from erfsfm.common.readers.camera_file import UNKNOWN_FOV_DEG, UNKNOWN_FX_SIGMA, CameraFile
 from slam.frames import Frame
-from slam.frontend.tracking import Sightings, follow
+from slam.frontend.followed_corners import FollowedCorners, follow
 from slam.geometry.multiview import LEAST_DEPTH, pixel_jacobian, rotation_between
 from slam.geometry.robust import mad_sigma, weighted_median
 from slam.geometry.se3 import FloatArray, compose, from_rotation_vector, invert, make
@@ -149,7 +149,7 @@ class Window(NamedTuple):
     turn_deg: float
 
 
-def windows_that_turn(seen: Sightings) -> list[Sightings]:
+def windows_that_turn(seen: FollowedCorners) -> list[FollowedCorners]:
     """The windows of keyframes whose images go furthest aside, at most six, the first keyframe of each its row 0."""
     keyframes = int(seen.keyframe.max(initial=-1)) + 1
     aside = np.zeros((keyframes, 2))
@@ -168,7 +168,7 @@ def windows_that_turn(seen: Sightings) -> list[Sightings]:
     return windows
 
 
-def calibrated(seen: Sightings, pixel: float) -> Window | None:
+def calibrated(seen: FollowedCorners, pixel: float) -> Window | None:
     """What a window says of its camera; ``pixel`` is its size in half widths. None where it tells nothing."""
     if (started := _turning(seen, pixel)) is None:
         return None
@@ -223,7 +223,7 @@ def joined(telling: Sequence[Window]) -> FoundCamera:
 class Problem:
     """Bundle adjustment of one window: cameras, homogeneous points and the lens that they share."""
 
-    def __init__(self, seen: Sightings, cameras: int) -> None:
+    def __init__(self, seen: FollowedCorners, cameras: int) -> None:
         self.seen, self._cameras = seen, cameras
 
     def errors(self, given: Reconstruction) -> FloatArray:
@@ -373,7 +373,7 @@ def _reduced(system: _System, damping: float) -> tuple[FloatArray, FloatArray, F
     return own - with_points.T @ W, side, np.asarray(inverse)
 
 
-def _turning(seen: Sightings, pixel: float) -> tuple[Problem, Reconstruction] | None:
+def _turning(seen: FollowedCorners, pixel: float) -> tuple[Problem, Reconstruction] | None:
     """A start by the usual lens: keyframes turn on the spot, as far as they share corners, and points are far."""
     rays = np.column_stack([seen.image * np.exp(-_PRIOR[0]), np.ones(len(seen))])
     R = [np.eye(3)]

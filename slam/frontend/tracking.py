@@ -8,11 +8,11 @@ are tracked in the image as it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Frame, Grey, Intrinsics, resized_mask
 from slam.geometry.multiview import UnitRelativePose
-from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray, invert
 
 Pixels = NDArray[np.float32]
@@ -41,9 +40,6 @@ ROTATION_BASELINE = 2
 LONGEST_STEP = 30  # frames across which corners are compared where nothing can be told apart
 # tracks below which they are sought again, with the wide window and equal exposure
 FEW_CORNERS = 60
-_FOLLOWED, _FOLLOWED_WIDTH_PX, _BORDER_PX = 500, 960, 8.0
-_KEYFRAME_MOVED = 0.06  # of half the width, from keyframe to keyframe
-_KEYFRAME_LOST = 0.5  # of the corners of the last keyframe
 _WIDE_WINDOW_PX = 31  # side of the window after most tracks were lost, pixels
 
 
@@ -85,11 +81,6 @@ KEYFRAME_SEARCH = Search(
 )
 STEP_CORNERS = Texture(quality=0.008, spacing_px=11.0, block_px=5)
 KEYFRAME_CORNERS = Texture(quality=0.0003, spacing_px=12.0, block_px=3)
-# corners of plain walls creep, and windows beyond the border slip: both bend a focal length by 3 %
-CALIBRATION_SEARCH = Search(
-    side=16, levels=4, limits=(20, 0.02), back=None, error_px=0.5, norm=np.inf, texture=1e-4
-)
-CALIBRATION_CORNERS = Texture(quality=0.01, spacing_px=10.0, block_px=5)
 
 
 def track(
@@ -442,69 +433,3 @@ class PredictedFlow:
 def _pixels(intrinsics: Intrinsics) -> NDArray[np.float32]:
     """Each pixel's own column and row ``(H, W, 2)``."""
     return intrinsics.pixel_grid().astype(np.float32)
-
-
-@dataclass(frozen=True)
-class Sightings:
-    """``S`` sightings: rows of keyframes and points ``(S,)``, ``image`` ``(S, 2)`` in half widths from the middle."""
-
-    keyframe: NDArray[np.int64]
-    point: NDArray[np.int64]
-    image: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.keyframe)
-
-    def shared(self, keyframe: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows of the points that the keyframe before shows as well, in that and in this one."""
-        before = np.flatnonzero(self.keyframe == keyframe - 1)
-        own = np.flatnonzero(self.keyframe == keyframe)
-        _, first, second = np.intersect1d(self.point[before], self.point[own], return_indices=True)
-        return before[first], own[second]
-
-    def chosen(self, rows: NDArray[Any], least: int) -> tuple[Sightings, NDArray[np.int64]]:
-        """Those of points that keep so many, numbered anew, and the points that are kept."""
-        keyframe, point, image = self.keyframe[rows], self.point[rows], self.image[rows]
-        often = np.bincount(point)[point] >= least
-        points, numbers = np.unique(point[often], return_inverse=True)
-        return Sightings(keyframe[often], numbers, image[often]), points
-
-
-def follow(frames: Iterable[Frame]) -> tuple[Sightings, float]:
-    """Sightings of corners in the keyframes of some frames, and the size of a pixel in half widths."""
-    rows: list[FloatArray] = []
-    pixels, ids = np.zeros((0, 2), np.float32), np.zeros(0, np.int64)
-    last, last_ids, sought, width, before = pixels, ids, 0, 1, None
-    for frame in frames:
-        frame = _narrow(frame)
-        height, width = frame.grey.shape
-        if before is not None:
-            pixels, kept = track(before, frame.grey, pixels, CALIBRATION_SEARCH)
-            inner = height - 2 * _BORDER_PX, width - 2 * _BORDER_PX
-            kept &= are_inside(pixels - _BORDER_PX, inner) & ~frame.is_fixed(pixels)
-            pixels, ids = pixels[kept], ids[kept]
-        before = frame.grey
-        _, own, at_last = np.intersect1d(ids, last_ids, return_indices=True)
-        moved = np.linalg.norm(pixels[own] - last[at_last], axis=1)
-        if (
-            len(own) > _KEYFRAME_LOST * len(last_ids)
-            and median(moved) < _KEYFRAME_MOVED * width / 2
-        ):
-            continue
-        corners = new_corners(frame, pixels, _FOLLOWED - len(pixels), CALIBRATION_CORNERS)
-        pixels = np.concatenate([pixels, corners])
-        ids = np.concatenate([ids, sought + np.arange(len(corners))])
-        sought += len(corners)
-        last, last_ids = pixels, ids
-        image = (pixels - [(width - 1) / 2, (height - 1) / 2]) * (2.0 / width)
-        rows.append(np.column_stack([np.full(len(ids), len(rows)), ids, image]))
-    table = np.concatenate(rows) if rows else np.zeros((0, 4))
-    keyframes, points = table[:, :2].T.astype(np.int64)
-    return Sightings(keyframes, points, table[:, 2:]), 2.0 / width
-
-
-def _narrow(frame: Frame) -> Frame:
-    """The same image, at most so wide that following its corners is quick."""
-    height, width = frame.image.shape[:2]
-    narrow = min(width, _FOLLOWED_WIDTH_PX)
-    return frame.resized(narrow, round(height * narrow / width))

@@ -201,11 +201,11 @@ def _counted_once(loops: Sequence[Loop], path: FloatArray, near: float) -> list[
     """
     ends = path[np.array([loop.ends for loop in loops], int).reshape(-1, 2)]
     alike = (np.abs(ends[:, None] - ends) < near).all(axis=2).sum(axis=1)
-    measured = (
-        replace(loop.measured, sigmas=float(np.sqrt(count)) * loop.measured.sigmas)
-        for loop, count in zip(loops, alike, strict=True)
-    )
-    return [replace(loop, measured=each) for loop, each in zip(loops, measured)]
+    widened = []
+    for loop, count in zip(loops, alike, strict=True):
+        sigmas = float(np.sqrt(count)) * loop.measured.sigmas
+        widened.append(replace(loop, measured=replace(loop.measured, sigmas=sigmas)))
+    return widened
 
 
 class Candidate(NamedTuple):

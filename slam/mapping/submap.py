@@ -273,13 +273,11 @@ class ViewChooser:
         """
         u, v, z = self._filters.projected(view, before)
         same = np.abs(sampled(before.depth, u, v) - z) < _SAME_SURFACE * z
-        rows, columns = np.nonzero(same)
-        of_both = (
-            _grey(view.image)[same],
-            sampled(_grey(before.image), u, v)[same],
-            _outwards(columns, rows, same.shape) - _outwards(u[same], v[same], same.shape),
-        )
-        here, there, moved = (each[::_STRIDE] for each in of_both)
+        rows, columns = (each[::_STRIDE] for each in np.nonzero(same))
+        here = _grey(view.image)[rows, columns]
+        there = sampled(_grey(before.image), u, v)[rows, columns]
+        u, v = u[rows, columns], v[rows, columns]
+        moved = _outwards(columns, rows, same.shape) - _outwards(u, v, same.shape)
         usable = (np.minimum(here, there) > _DARK) & (np.maximum(here, there) < _BRIGHT)
         if usable.sum() < _LEAST_SHARED:
             return np.full(3, np.nan)

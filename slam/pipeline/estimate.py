@@ -175,9 +175,8 @@ def keyframe_depths(
         depth, sigma = (error.corrected(learned) * scale).astype(np.float32), None
         if refiner is not None and (refined := refiner.refine(n, depth)) is not None:
             depth, sigma = refined.depth, refined.relative_sigma
-            sigma[learned == 0] = (
-                np.inf
-            )  # what is fixed to the camera, as its neighbours show it, too
+            # what is fixed to the camera, as its neighbours show it, too
+            sigma[learned == 0] = np.inf
         elif refiner is not None and guess_sigma is not None:
             sigma = np.full_like(depth, guess_sigma)
         pose, of_network = T_world_camera[keyframe.index], learned * np.float32(scale)

@@ -138,9 +138,10 @@ class KeyframeTracking:
         if self._measuring is None or not self._measuring.segments:
             return None
         segment = self._measuring.segments[-1]
-        recent = (each for each in segment.frames[-_FRAMES:] if each.index <= index)
-        poses = ((each.index, each.T_camera_world) for each in recent)
-        located = [(k, T) for k, T in poses if T is not None]
+        located: list[tuple[int, FloatArray]] = []
+        for each in segment.frames[-_FRAMES:]:
+            if each.index <= index and each.T_camera_world is not None:
+                located.append((each.index, each.T_camera_world))
         if len(located) < 2 or located[-1][0] != index:
             return None
         (before, T_before_map), (_, T_frame_map) = located[-2:]

@@ -332,8 +332,10 @@ def _merged_tracks(
 
 
 def _renumbered(segment: LocalMap, tracks: TrackIds) -> LocalMap:
-    renumbered = ((keyframe, tracks[keyframe.track_ids]) for keyframe in segment.keyframes)
-    keyframes = [each.with_corners(np.argsort(merged), merged) for each, merged in renumbered]
+    keyframes = []
+    for keyframe in segment.keyframes:
+        merged = tracks[keyframe.track_ids]
+        keyframes.append(keyframe.with_corners(np.argsort(merged), merged))
     points = segment.points.copy()
     lonely = np.flatnonzero(np.isnan(points[tracks, 0]) & np.isfinite(points[:, 0]))
     points[tracks[lonely]] = points[lonely]

@@ -129,7 +129,7 @@ class VisualOdometry:
 
         Args:
             previous: the earlier frame, at the size of the intrinsics.
-            current: a later frame, measured once.
+            current: a later frame; measured again from an earlier one where both hardly differ.
             depth_previous_unscaled: learned z-depth ``(H, W)`` of the earlier frame.
             height_unscaled: camera height in the same unit; where known, depths of more than
                 30 times as much are not trusted.

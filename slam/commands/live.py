@@ -141,7 +141,7 @@ class LiveRecorder(FolderRecorder):
             late_ms = None if at_s is None else round(1e3 * (time.monotonic() - at_s), 1)
             self._emit(message | {"latency_ms": late_ms, "dropped": sequence.dropped})
             if self._viewer is not None:
-                self._viewer.show(index, observer.drive, newest)
+                self._viewer.show(index, observer.measured, newest)
 
     def estimate(self, estimate: Estimate) -> None:
         """Also say all poses again as the whole drive gives them, and why it ended."""

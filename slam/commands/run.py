@@ -246,9 +246,9 @@ class FolderRecorder(Recorder):
                 from slam.results.report.figures import map_view  # with Plotly
 
                 drive, fixed = estimate.drive, []
-                if drive.fixed is not None and drive.keyframes:
+                if drive.measured.fixed is not None and drive.keyframes:
                     image = drive.keyframes[len(drive.keyframes) // 2].image
-                    fixed = fixed_pictures(image, drive.fixed)
+                    fixed = fixed_pictures(image, drive.measured.fixed)
                 pictures = self._depths.pictures(), self._loop_pictures(estimate)
                 write_report(self.folder, *pictures, map_view(self.folder), metrics, fixed)
 

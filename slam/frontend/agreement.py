@@ -15,9 +15,10 @@ import numpy as np
 from scipy.special import erf
 
 from slam.frames import Ends, Intrinsics, RelativePose, runs
-from slam.frontend.drive import Drive, named
+from slam.frontend.drive import Drive
+from slam.frontend.measured import named
 from slam.frontend.self_calibration import SURE
-from slam.frontend.visual.motion import Motion, triangulated
+from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.self_calibration import DepthError, FocalLength
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
@@ -210,7 +211,7 @@ def of_images(
     interpolated = len(drive.interpolated)
     guessed = len(drive.segments) - 1
     # with maps of keyframes, lengths are those of the maps
-    steps = 0 if drive.maps else len(triangulated(drive.steps))
+    steps = 0 if drive.by_keyframes else len(drive.triangulated)
     on_road = len(drive.road_steps)
     gaps = float(np.hypot(interpolated / frames / _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS * guessed))
     figure = f"{interpolated} of {frames} frames are interpolated"
@@ -222,18 +223,18 @@ def of_images(
             figure += f", which end at frames {named([last for _, last in contradicted])}"
         sigmas = len(contradicted) / steps / _CONTRADICTED_SPREAD
         compared("the length of steps", sigmas, figure)
-    corners_were_asked = bool(drive.motions or drive.failures)
+    corners_were_asked = bool(drive.steps or drive.measured.failures)
     if corners_were_asked and (support := drive.support) is not None:
         compared("the overlap of images", *_overlap(support))
     if needs_road and steps >= _LEAST:
         sigmas = (_ON_ROAD - on_road / steps) / _ON_ROAD_SPREAD
         figure = f"{on_road} of {steps} lengths were measured on the road; the others follow from learned depth"
         compared("the view of the road", sigmas, figure)
-    too_far = drive.depth_error.most_too_far(_FAR_CORNERS)
+    too_far = drive.measured.depth_error.most_too_far(_FAR_CORNERS)
     if needs_road and steps and too_far is not None:
         figure = f"it is up to {100 * np.expm1(too_far):.0f} % farther than triangulated, as where a lens zooms"
         compared("learned depth far away", too_far / _FAR_SPREAD, figure)
-    by_corners = of_focal_length(drive.focal_length, camera)
+    by_corners = of_focal_length(drive.measured.focal_length, camera)
     if by_corners is not None:
         agreements.append(by_corners)
     for each in agreements[1:]:  # gaps and segments were said by their frames

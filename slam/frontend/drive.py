@@ -1,79 +1,22 @@
-"""The measurements of one drive: collected frame by frame, then completed after the last frame."""
+"""A drive as it is known after its last frame: gaps filled, rotations smoothed, its road and its segments."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass, field, replace
-from itertools import takewhile
-from typing import Any, TypeVar
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 
-import numpy as np
-
-from slam.frames import (
-    DepthMap,
-    Ends,
-    Frame,
-    Image,
-    Intrinsics,
-    Mask,
-    RelativePose,
-    SnippetPoses,
-    TrackingEvent,
-    View,
-    resized_depth,
-    runs,
-)
-from slam.frontend.keyframes.local_map import LocalMap
-from slam.frontend.keyframes.relative_poses import KeyframePoses
-from slam.frontend.road import RoadStep
-from slam.frontend.visual.motion import Motion, RelativeRotation, Steps
-from slam.frontend.visual.self_calibration import DepthError, FocalLength
+from slam.frames import Ends, RelativePose, SnippetPoses, TrackingEvent, View, runs
+from slam.frontend.gaps import interpolate_gaps
+from slam.frontend.keyframes.relative_poses import NO_MAPS, KeyframePoses
+from slam.frontend.measured import FrontEnd, Keyframe, Measured, frame_support
+from slam.frontend.road import RoadStep, with_slope
+from slam.frontend.rotations import smooth_rotations
+from slam.frontend.visual.motion import Motion, Steps, triangulated
 from slam.geometry.se3 import FloatArray
-from slam.runtime.errors import Failed
-from slam.runtime.memory import SpilledArray, SpillFile
 
-T = TypeVar("T")
-
-MAP_WIDTH_PX = 416  # of the depth that is fused: that of the networks
-_MOST_NAMED = 10  # stretches of frames in a sentence
-LAST_STEPS = 4  # in which the step to one of the last frames is looked up
 DOUBLED = "the image repeats the one before while the camera moves"
-
-
-@dataclass(frozen=True)
-class Keyframe:
-    """A frame for fusion, thinned and spilled to disk."""
-
-    index: int
-    spilled_image: SpilledArray
-    spilled_depth: SpilledArray
-
-    @classmethod
-    def of(cls, frame: Frame, depth_unscaled: DepthMap, spill_file: SpillFile) -> Keyframe:
-        """Thin a frame and its depth, of any size, to at most ``MAP_WIDTH_PX`` and spill both."""
-        height, width = frame.image.shape[:2]
-        ratio = min(MAP_WIDTH_PX / width, 1.0)
-        size = (max(round(width * ratio), 1), max(round(height * ratio), 1))
-        image, depth = frame.resized(*size).image, resized_depth(depth_unscaled, *size)
-        return cls(frame.index, spill_file.put(image), spill_file.put(depth))
-
-    @property
-    def image(self) -> Image:
-        """``(h, w, 3)``."""
-        return self.spilled_image.read()
-
-    @property
-    def depth_unscaled(self) -> DepthMap:
-        """``(h, w)``."""
-        return self.spilled_depth.read()
-
-    def cloud_unscaled(self, intrinsics: Intrinsics, stride: int) -> FloatArray:
-        """Points ``(M, 3)`` in its camera, of every ``stride``-th pixel; intrinsics of any size."""
-        depth = self.depth_unscaled
-        camera = intrinsics.resized(*depth.shape[::-1])
-        v, u = np.mgrid[: camera.height : stride, : camera.width : stride].reshape(2, -1)
-        points = camera.rays(np.column_stack([u, v])) * depth[v, u, None]
-        return np.asarray(points[points[:, 2] > 0])
+_LONGEST_GAP = 30  # interpolated frames, after which the place is only guessed
 
 
 @dataclass(frozen=True)
@@ -85,60 +28,57 @@ class Segment:
     reason: str
 
 
-@dataclass
+@dataclass(frozen=True)
 class Drive:
-    """Measurements of a drive in the networks' unit of length.
+    """A drive whose every frame is related to the one before, in the networks' unit of length.
 
-    Collected frame by frame, each list and dictionary growing at its end:
-        ``motions`` are all steps that image geometry measured, ``road_steps`` the lengths by the
-        road's homography, ``relative_rotations`` the rotations across several steps; ``failures``
-        are unmeasured steps with the reason. ``roads`` has one entry a frame, the camera's height
-        over the ground plane. ``unusable`` are frames without a measurement, with the reason,
-        ``repeated`` frames with the image of the one before, ``moving`` those of them just before
-        which the camera moved. ``depth_error`` is that of learned depth and ``focal_length`` the
-        one that corners show, as the steps have them. ``maps`` are those of keyframes and
-        ``events`` what became of them; a drive measured by steps alone has none. ``fixed`` is the
-        part of the last image that is fixed to the camera.
-
-    Added by `slam.frontend.completion.complete_drive`, which also leaves out views and keyframes of
-    interpolated frames, fills ``snippets`` to one a target, and smooths the rotations of
-    ``motions``:
-        ``trusted`` are the snippets that the network measured on usable frames, ``interpolated``
-        the frames of gaps with the reason, ``gap_steps`` their steps, ``map_poses`` the poses by
-        the maps.
+    Attributes:
+        measured: what it was completed from.
+        steps: those of image geometry, their rotations smoothed; none between interpolated frames.
+        road_steps: lengths by the road, with the camera's pitch by the path.
+        snippets: of the pose network, one a target; missing ones are interpolated.
+        trusted: those that it measured on usable frames.
+        interpolated: the frames of gaps, with the reason.
+        gap_steps: the steps of gaps.
+        segments: parts of the drive that no measurement relates.
+        map_poses: poses by the maps of keyframes.
+        events: what became of these maps.
     """
 
-    snippets: list[SnippetPoses] = field(default_factory=list)
-    motions: list[Motion] = field(default_factory=list)
-    road_steps: dict[Ends, RoadStep] = field(default_factory=dict)
-    relative_rotations: list[RelativeRotation] = field(default_factory=list)
-    failures: list[tuple[int, int, str]] = field(default_factory=list)
-    roads: list[float | Failed] = field(default_factory=list)
-    views: list[View] = field(default_factory=list)
-    keyframes: list[Keyframe] = field(default_factory=list)
-    unusable: dict[int, str] = field(default_factory=dict)
-    repeated: list[int] = field(default_factory=list)
-    moving: list[int] = field(default_factory=list)
-    depth_error: DepthError = field(default_factory=DepthError)
-    focal_length: FocalLength = field(default_factory=FocalLength)
-    fixed: Mask | None = None
-
-    trusted: list[SnippetPoses] = field(default_factory=list)
-    interpolated: dict[int, str] = field(default_factory=dict)
-    gap_steps: list[RelativePose] = field(default_factory=list)
-    segments: list[Segment] = field(default_factory=list)
-    maps: list[LocalMap] = field(default_factory=list)
-    map_poses: KeyframePoses = field(default_factory=KeyframePoses)
-    events: list[TrackingEvent] = field(default_factory=list)
+    measured: Measured
+    steps: Steps = field(default_factory=dict)
+    road_steps: Mapping[Ends, RoadStep] = field(default_factory=dict)
+    snippets: Sequence[SnippetPoses] = ()
+    trusted: Sequence[SnippetPoses] = ()
+    interpolated: Mapping[int, str] = field(default_factory=dict)
+    gap_steps: Sequence[RelativePose] = ()
+    segments: Sequence[Segment] = ()
+    map_poses: KeyframePoses = NO_MAPS
+    events: Sequence[TrackingEvent] = ()
 
     def __len__(self) -> int:
         """Number of frames."""
-        return len(self.roads)
+        return len(self.measured)
 
     @property
-    def steps(self) -> Steps:
-        """The steps of image geometry; a later one replaces an earlier one between the same frames."""
-        return {motion.ends: motion for motion in self.motions}
+    def by_keyframes(self) -> bool:
+        """Whether maps of keyframes give the poses, and not steps."""
+        return self.measured.front_end is FrontEnd.KEYFRAMES
+
+    @cached_property
+    def triangulated(self) -> Mapping[Ends, Motion]:
+        """The steps whose length is free."""
+        return triangulated(self.steps)
+
+    @cached_property
+    def views(self) -> list[View]:
+        """Those of frames that are not interpolated."""
+        return [view for view in self.measured.views if view.index not in self.interpolated]
+
+    @cached_property
+    def keyframes(self) -> list[Keyframe]:
+        """Those for the map, of frames that are not interpolated."""
+        return [each for each in self.measured.keyframes if each.index not in self.interpolated]
 
     @property
     def doubled(self) -> list[int]:
@@ -146,9 +86,9 @@ class Drive:
 
         More in a row are a camera that stands. At the end of a drive nobody knows.
         """
-        moving = set(self.moving).difference(self.interpolated)
+        moving = set(self.measured.moving).difference(self.interpolated)
         found: list[int] = []
-        for first, last in runs(self.repeated):
+        for first, last in runs(self.measured.repeated):
             if last - first < 2 and last < len(self) - 1:
                 found += sorted(moving.intersection(range(first, last + 1)))
         return found
@@ -156,69 +96,100 @@ class Drive:
     @property
     def support(self) -> FloatArray | None:
         """`frame_support` of all frames ``(N,)``; None where maps of keyframes give the poses."""
-        return None if self.maps else frame_support(range(len(self)), self.motions)
-
-    def last_step(self, index: int) -> Motion | None:
-        """The step to one of the last frames, where image geometry measured it."""
-        return next(
-            (motion for motion in self.motions[-LAST_STEPS:] if motion.ends[1] == index), None
-        )
-
-    def copy(self) -> Drive:
-        """A snapshot: what is measured later is added to one of both alone."""
-        own: dict[str, Any] = {
-            name: each.copy() for name, each in vars(self).items() if isinstance(each, list | dict)
-        }
-        return replace(self, **own)
-
-    def since(self, first: int) -> Drive:
-        """The measurements from frame ``first`` on, which becomes frame 0; without views and keyframes.
-
-        It takes as long as there are frames since, however long the drive.
-        """
-
-        def last(items: Iterable[T], start: Callable[[T], int]) -> list[T]:
-            """The items that begin in the window, of items in order of time that may span a few frames."""
-            return list(takewhile(lambda item: start(item) >= first, items))[::-1]
-
-        def renumbered(ends: Ends) -> Ends:
-            return ends[0] - first, ends[1] - first
-
-        window = Drive(roads=self.roads[first:])
-        for snippet in last(reversed(self.snippets), lambda snippet: min(snippet.sources)):
-            target = snippet.target - first
-            sources = tuple(source - first for source in snippet.sources)
-            window.snippets.append(replace(snippet, target=target, sources=sources))
-        for motion in last(reversed(self.motions), lambda motion: motion.ends[0]):
-            from_index, to_index = renumbered(motion.ends)
-            pose = replace(motion.relative_pose, from_index=from_index, to_index=to_index)
-            window.motions.append(replace(motion, relative_pose=pose))
-        for ends, step in last(reversed(self.road_steps.items()), lambda item: item[0][0]):
-            window.road_steps[renumbered(ends)] = step
-        for turn in last(reversed(self.relative_rotations), lambda turn: turn.ends[0]):
-            window.relative_rotations.append(replace(turn, ends=renumbered(turn.ends)))
-        for earlier, later, why in last(reversed(self.failures), lambda failure: failure[0]):
-            window.failures.append((*renumbered((earlier, later)), why))
-        for frame, why in last(reversed(self.unusable.items()), lambda item: item[0]):
-            window.unusable[frame - first] = why
-        for frame in last(reversed(self.repeated), lambda frame: frame):
-            window.repeated.append(frame - first)
-        return window
+        return None if self.by_keyframes else frame_support(range(len(self)), self.steps.values())
 
 
-def frame_support(frames: range, motions: Iterable[Motion]) -> FloatArray:
-    """The share of the corners that fit the motion to each frame ``(N,)``, 0 without one; the first has the next's."""
-    found: dict[int, float] = {}
-    for motion in motions:
-        found[motion.ends[1]] = max(found.get(motion.ends[1], 0.0), motion.support)
-    found[0] = found.get(1, 0.0)
-    return np.array([found.get(frame, 0.0) for frame in frames])
+def find_cuts(
+    failures: Sequence[tuple[int, int, str]], measured: Collection[Ends], doubtful: Collection[int]
+) -> list[int]:
+    """Frames that show another place than the frame before: their step failed, the steps before and after did not.
+
+    Args:
+        failures: steps that image geometry could not measure, and why.
+        measured: steps that it measured.
+        doubtful: frames that are unusable or repeat the one before.
+    """
+    ends = set(measured)
+    crossed: set[int] = set()  # frames across whose beginning a longer step measures
+    for first, last in ends:
+        if last - first > 1:
+            crossed.update(range(first + 1, last + 1))
+    cuts = []
+    for first, last, _ in failures:
+        around = {first - 1, first, last, last + 1}
+        alone = last == first + 1 and (first - 1, first) in ends and (last, last + 1) in ends
+        if alone and around.isdisjoint(doubtful) and last not in crossed:
+            cuts.append(last)
+    return sorted(set(cuts))
 
 
-def named(frames: Collection[int]) -> str:
-    """Stretches of frames in words, the first ten of them."""
-    found = runs(frames)
-    words = [
-        f"{first} to {last}" if last > first else str(first) for first, last in found[:_MOST_NAMED]
+def find_segments(
+    count: int,
+    cuts: Collection[int],
+    interpolated: Mapping[int, str],
+    is_related: Callable[[int], bool],
+) -> list[Segment]:
+    """The segments of a drive, by its cuts and its long gaps.
+
+    Args:
+        count: frames of the drive.
+        cuts: frames that show another place than the frame before.
+        interpolated: frames of gaps, with the reason.
+        is_related: tells of a frame whether a map of keyframes relates the frames from it on to
+            those before.
+    """
+    between = [cut for cut in cuts if not is_related(cut)]
+    begins = {0: ""} | dict.fromkeys(between, "it shows another place than the frame before")
+    ends = {count - 1} | {cut - 1 for cut in between}
+    for first, last in runs(interpolated):
+        if (
+            last - first + 1 > _LONGEST_GAP
+            and first > 0
+            and last + 1 < count
+            and not is_related(last + 1)
+        ):
+            ends.add(first - 1)
+            begins[last + 1] = (
+                f"{last - first + 1} frames before it are interpolated: {interpolated[first]}"
+            )
+    return [
+        Segment(first, last, begins[first])
+        for first, last in zip(sorted(begins), sorted(ends), strict=True)
     ]
-    return ", ".join(words) + ", ..." * (len(found) > _MOST_NAMED)
+
+
+def complete_drive(
+    measured: Measured,
+    sources: int,
+    map_poses: KeyframePoses = NO_MAPS,
+    joins: Sequence[TrackingEvent] = (),
+) -> Drive:
+    """The drive with its gaps interpolated, its rotations smoothed, its road by its path, and its segments.
+
+    More frames may follow: what was measured stays as it is.
+
+    Args:
+        measured: as it was collected.
+        sources: frames of a snippet besides its target.
+        map_poses: poses by the maps of keyframes of the drive.
+        joins: events of loops that join these maps.
+
+    Raises:
+        SlamError: no snippet was measured, so there is no motion to extrapolate.
+    """
+    ends = {*measured.steps, *map_poses.steps}
+    cuts = find_cuts(measured.failures, ends, {*measured.unusable, *measured.repeated})
+    filled = interpolate_gaps(measured, sources, cuts, map_poses)
+    smoothed = smooth_rotations(filled.steps, measured.relative_rotations)
+    return Drive(
+        measured,
+        smoothed,
+        with_slope(measured.road_steps, smoothed),
+        filled.snippets,
+        filled.trusted,
+        filled.interpolated,
+        filled.gap_steps,
+        find_segments(len(measured), cuts, filled.interpolated, map_poses.relates),
+        map_poses,
+        sorted([*measured.events, *joins], key=lambda event: event.frame),
+    )

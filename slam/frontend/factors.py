@@ -1,71 +1,45 @@
-"""All relative-pose factors of a run, made once from all measurements, and the odometry chained from them.
-
-The pose network's lengths have a unit of their own, which is not that of learned depth and changes
-with the street. Both it and the network's noise are measured against the steps of image geometry
-(``docs/design/learned-priors.md``).
-"""
+"""All relative-pose factors of a run, made once from all measurements, and the odometry chained from them."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import reduce
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from slam.frames import KEYFRAME_SOURCE, RelativePose, SnippetPoses, runs
+from slam.frames import KEYFRAME_SOURCE, RelativePose, runs
 from slam.frontend.drive import Drive
+from slam.frontend.gaps import INTERPOLATED_SOURCE
 from slam.frontend.keyframes.relative_poses import KeyframePoses, chained
-from slam.frontend.scale import Scale
-from slam.frontend.visual.motion import triangulated
-from slam.frontend.visual.noise import step_noise
-from slam.geometry.robust import MAD_TO_SIGMA, running_median
-from slam.geometry.se3 import (
-    FloatArray,
-    chain,
-    compose,
-    from_rotation_vector,
-    invert,
-    rigid,
-    tangent,
+from slam.frontend.lidar_odometry import LIDAR_SOURCE
+from slam.frontend.network_motion import (
+    NETWORK_SOURCE,
+    STUDENT_T_DOF,
+    calibrate_network,
+    network_factors,
+    network_steps,
 )
+from slam.frontend.scale import Scale
+from slam.frontend.visual.noise import step_noise
+from slam.geometry.se3 import FloatArray, compose, equal_step, invert, rigid
 
 logger = logging.getLogger(__name__)
-NETWORK_SOURCE = "network"
-STUDENT_T_DOF = 12.0  # of the errors of measured steps: degrees of freedom of Student's t
-# steps that image geometry measured too, from which on unit and noise are measured
-LEAST_PAIRS = 20
-_NEAREST_PAIRS = 40  # in time, by which they are measured
-_LONGEST_PAIR = 4  # frames: as far as a snippet reaches
-_SHORTEST_PAIR = 0.1  # over the median length of a step: shorter ones say nothing about the unit
-_CORRELATED_STEPS = 50  # over which errors are taken as equal
-# of a step whose noise is not measured: radians, and over its length in the unit of learned depth,
-# from which that of the network differs by so much from drive to drive
-_USUAL_SIGMAS = np.repeat([np.deg2rad(0.3), 0.3], 3)
-_LEAST_SIGMAS = np.repeat([np.deg2rad(0.03), 0.02], 3)
 
 
-def make_factors(
-    drive: Drive, scale: Scale, lidar_steps: Sequence[RelativePose] = (), level: int = logging.INFO
-) -> list[RelativePose]:
-    """All relative poses of a completed drive with their noise, in the unit of the scale.
-
-    The least certain come first, and odometry is chained by the last ones; steps by LiDAR stand
-    before those of image geometry.
+def make_factors(drive: Drive, scale: Scale, level: int = logging.INFO) -> list[RelativePose]:
+    """All relative poses that the images give of a drive with their noise, in the unit of the scale.
 
     Args:
         drive: completed.
         scale: of that drive.
-        lidar_steps: steps by LiDAR, metres.
         level: of the line in the log that says what the pose network measured.
     """
     maps = drive.map_poses
     geometric = []
-    noise = step_noise(triangulated(drive.steps), len(scale.per_frame))
+    noise = step_noise(drive.triangulated, len(scale.per_frame))
     for ends, motion in drive.steps.items():
         length = scale.lengths.get(ends)
         if motion.is_triangulated and length is not None:
@@ -87,7 +61,7 @@ def make_factors(
     interpolated = join_gap_ends(
         interpolated, [*by_network, *by_image], by_keyframes, maps.segments
     )
-    return [*by_network, *interpolated, *lidar_steps, *by_image, *by_keyframes]
+    return [*by_network, *interpolated, *by_image, *by_keyframes]
 
 
 def _outside(maps: KeyframePoses, poses: Sequence[RelativePose]) -> list[RelativePose]:
@@ -128,176 +102,15 @@ def chain_odometry(factors: Sequence[RelativePose], count: int) -> FloatArray:
     return T_world_camera
 
 
-def _precedence(factor: RelativePose) -> tuple[bool, bool, int]:
-    """After a gap, a place in the map is known better than any motion over the gap; the network is known least."""
-    return factor.source == KEYFRAME_SOURCE, factor.source != NETWORK_SOURCE, factor.from_index
+def _precedence(factor: RelativePose) -> tuple[bool, bool, int, bool, bool]:
+    """After a gap, a place in the map is known better than any motion over the gap; the network is known least.
 
-
-@dataclass(frozen=True)
-class NetworkCalibration:
-    """Unit and noise of the pose network's steps from each of N frames, measured on the drive.
-
-    Attributes:
-        unit: ``(N,)``, length per unscaled length of the step.
-        sigmas: ``(N, 6)`` of the step, rotation in radians, then translation over the usual length
-            of a step.
-        pairs: steps that image geometry measured too; with fewer than 20 of them the unit is that
-            of learned depth.
+    Of two other measurements of one step that by LiDAR replaces a guess, and images replace LiDAR.
     """
-
-    unit: FloatArray
-    sigmas: FloatArray
-    pairs: int
-
-    @property
-    def is_measured(self) -> bool:
-        """Whether enough steps measured the unit and the noise."""
-        return self.pairs >= LEAST_PAIRS
-
-    def over(self, depth_unit: FloatArray) -> str:
-        """The unit over that of learned depth ``(N,)`` and the noise, for logs."""
-        if not self.is_measured:
-            return (
-                f"fewer than {LEAST_PAIRS} steps measure its unit, that of learned depth is taken"
-            )
-        least, usual, most = np.quantile(self.unit / depth_unit, (0.0, 0.5, 1.0))
-        rotation = np.rad2deg(np.median(self.sigmas[:, :3]))
-        translation = np.median(self.sigmas[:, 5])
-        return (
-            f"by {self.pairs} steps its unit is {usual:.2f} ({least:.2f} to {most:.2f}) of that of learned depth, and "
-            f"its noise {rotation:.2f} degrees and {100 * translation:.0f} % of a step"
-        )
-
-    def scaled(self, steps: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
-        """Steps ``T_k_next`` by k in the unit."""
-        scaled = {}
-        for k, T_k_next in steps.items():
-            scaled[k] = T_k_next.copy()
-            scaled[k][:3, 3] *= self.unit[k]
-        return scaled
-
-
-def network_steps(snippets: Sequence[SnippetPoses]) -> dict[int, FloatArray]:
-    """``T_k_next`` by k, unscaled: the mean of the snippets that see both frames."""
-    seen: dict[int, list[FloatArray]] = {}
-    for snippet in snippets:
-        for k, T_k_next in _steps(snippet).items():
-            seen.setdefault(k, []).append(T_k_next)
-    means = rigid(np.array([np.mean(each, axis=0) for each in seen.values()]).reshape(-1, 4, 4))
-    return dict(sorted(zip(seen, means, strict=True), key=lambda step: step[0]))
-
-
-def calibrate_network(
-    steps: Mapping[int, FloatArray], geometric: Sequence[RelativePose], depth_unit: FloatArray
-) -> NetworkCalibration:
-    """The unit and the noise of the network's steps, by the poses that image geometry measured too.
-
-    At a frame, they are medians over the pairs nearest in time. With fewer than 20 pairs, lengths
-    are in the unit of learned depth, and accordingly uncertain.
-
-    Args:
-        steps: ``T_k_next`` by k, unscaled.
-        geometric: poses by image geometry, also across several frames.
-        depth_unit: unit of these poses per unit of learned depth at each frame ``(N,)``.
-    """
-    pairs, by_network = [], []
-    for pose in geometric:
-        between = range(*pose.ends)
-        if 0 < len(between) <= _LONGEST_PAIR and steps.keys() >= set(between):
-            pairs.append(pose)
-            by_network.append(reduce(np.matmul, (steps[k] for k in between)))
-    if len(pairs) < LEAST_PAIRS:
-        return _by_depth(depth_unit, len(pairs))
-    first, last = np.array([pose.ends for pose in pairs]).T
-    T_network = np.array(by_network)
-    T_geometric = np.array([pose.T_from_to for pose in pairs])
-    t_network, t_geometric = T_network[:, :3, 3], T_geometric[:, :3, 3]
-    length = np.linalg.norm(t_geometric, axis=1)
-    frames = last - first
-    # along the measured motion, where the network's noise has no bias, as it has in the length
-    ratio = (t_network * t_geometric).sum(axis=1) / np.maximum(length, 1e-12) ** 2
-    used = (ratio > 0) & (length > _SHORTEST_PAIR * np.median(length / frames) * frames)
-    if used.sum() < LEAST_PAIRS:
-        return _by_depth(depth_unit, int(used.sum()))
-    unit = 1.0 / _nearest_median(first[used], ratio[used], len(depth_unit))
-    t_network *= unit[first, None]
-    reach = np.where(np.arange(6) < 3, frames[:, None], length[:, None])
-    error = np.abs(tangent(invert(T_network[used]) @ T_geometric[used])) / reach[used]
-    # the unit follows image geometry, and so shares its errors
-    shared = np.array([pose.sigmas for pose in pairs])[used] / reach[used]
-    own = _nearest_median(first[used], error, len(unit))
-    of_geometry = _nearest_median(first[used], shared, len(unit))
-    sigmas = np.hypot(MAD_TO_SIGMA * own, of_geometry)
-    return NetworkCalibration(unit, np.maximum(sigmas, _LEAST_SIGMAS), int(used.sum()))
-
-
-def network_factors(
-    steps: Mapping[int, FloatArray], calibration: NetworkCalibration
-) -> list[RelativePose]:
-    """A factor for every step ``T_k_next`` of the network, in the unit of the calibration."""
-    if not steps:
-        return []
-    scaled = calibration.scaled(steps)
-    lengths = np.array([np.linalg.norm(T_k_next[:3, 3]) for T_k_next in scaled.values()])
-    # sigmas by its own length would give a step that came out short more weight, and a drive that
-    # is too short
-    usual = running_median(lengths, _NEAREST_PAIRS + 1)
-    reach = np.maximum(usual, _SHORTEST_PAIR * np.median(lengths)).clip(1e-9)
-    # with nothing beside them, the usual sigmas are wide enough by themselves
-    widening = np.sqrt(_CORRELATED_STEPS) if calibration.is_measured else 1.0
-    factors = []
-    for (k, T_k_next), length in zip(scaled.items(), reach, strict=True):
-        sigmas = calibration.sigmas[k] * np.repeat([1.0, length], 3)
-        factors.append(
-            RelativePose(
-                k, k + 1, T_k_next, sigmas, NETWORK_SOURCE, widening * sigmas, STUDENT_T_DOF
-            )
-        )
-    return factors
-
-
-def chain_raw(snippets: Sequence[SnippetPoses], count: int) -> FloatArray:
-    """The network trajectory: target to next source of each snippet, without a graph.
-
-    Frames before the first target and after the last come from the direct poses of these two
-    snippets. There is one a target, in time order without gaps.
-
-    Returns:
-        ``T_world_camera`` ``(count, 4, 4)``, unscaled, the first the identity.
-    """
-    steps: dict[int, FloatArray] = {}
-    for snippet in snippets:
-        for k, T_k_next in _steps(snippet).items():
-            if k == snippet.target or k not in steps:
-                steps[k] = T_k_next
-    return chain(np.array([steps[k] for k in range(count - 1)]))
-
-
-def _steps(snippet: SnippetPoses) -> dict[int, FloatArray]:
-    T_target = snippet.T_target_camera
-    return {
-        k: invert(T_target[k]) @ T_target[k + 1]
-        for k in range(min(snippet.sources), max(snippet.sources))
-    }
-
-
-def _by_depth(depth_unit: FloatArray, pairs: int) -> NetworkCalibration:
-    return NetworkCalibration(depth_unit, np.tile(_USUAL_SIGMAS, (len(depth_unit), 1)), pairs)
-
-
-def _nearest_median(frames: NDArray[np.int64], values: FloatArray, count: int) -> FloatArray:
-    """The median value ``(count, ...)`` of the pairs nearest to each frame, of pairs ``(P, ...)`` by first frames."""
-    order, width = np.argsort(frames, kind="stable"), min(_NEAREST_PAIRS, len(frames))
-    windows = np.lib.stride_tricks.sliding_window_view(values[order], width, axis=0)
-    place = np.searchsorted(frames[order], np.arange(count)) - width // 2
-    return np.asarray(np.median(windows, axis=-1)[np.clip(place, 0, len(windows) - 1)])
-
-
-def equal_step(T_a_b: FloatArray, n: int) -> FloatArray:
-    """One of n equal steps from a to b: the transform ``(4, 4)`` whose n-th power is ``T_a_b``."""
-    rotation_vector = Rotation.from_matrix(T_a_b[:3, :3]).as_rotvec() / n
-    powers = Rotation.from_rotvec(np.arange(n)[:, None] * rotation_vector).as_matrix()
-    return from_rotation_vector(rotation_vector, np.linalg.solve(powers.sum(axis=0), T_a_b[:3, 3]))
+    source = factor.source
+    by_map, by_network = source == KEYFRAME_SOURCE, source == NETWORK_SOURCE
+    is_guess, by_lidar = source == INTERPOLATED_SOURCE, source == LIDAR_SOURCE
+    return by_map, not by_network, factor.from_index, not is_guess, not by_lidar
 
 
 def join_gap_ends(

@@ -7,15 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from slam.frames import RelativePose, SnippetPoses, runs
-from slam.frontend.drive import Drive
-from slam.frontend.factors import calibrate_network, equal_step, network_steps
 from slam.frontend.keyframes.relative_poses import NO_MAPS, KeyframePoses
+from slam.frontend.measured import Measured
+from slam.frontend.network_motion import calibrate_network, network_steps
 from slam.frontend.visual.motion import Motion, Steps
-from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert, tangent
+from slam.geometry.se3 import FloatArray, chain, equal_step, from_rotation_vector, invert, tangent
 from slam.runtime.errors import SlamError
 
 INTERPOLATED_SOURCE = "interpolated"
@@ -29,15 +30,25 @@ _ROTATION_SIGMA_DEG = 2.0  # rotation sigma of an interpolated step, degrees
 _TRANSLATION_RELATIVE_SIGMA = 0.5  # translation sigma over the length of an interpolated step
 
 
+class Filled(NamedTuple):
+    """What is known of all frames: the records of `slam.frontend.drive.Drive` of the same names."""
+
+    steps: Steps
+    snippets: Sequence[SnippetPoses]
+    trusted: Sequence[SnippetPoses]
+    interpolated: Mapping[int, str]
+    gap_steps: Sequence[RelativePose]
+
+
 def interpolate_gaps(
-    drive: Drive, sources: int, cuts: Collection[int] = (), map_poses: KeyframePoses = NO_MAPS
-) -> Drive:
-    """The drive with steps and snippets in its gaps, and without what was measured on interpolated frames.
+    measured: Measured, sources: int, cuts: Collection[int] = (), map_poses: KeyframePoses = NO_MAPS
+) -> Filled:
+    """Steps and snippets also in the gaps, and without what was measured on interpolated frames.
 
     Steps over a gap are between its two ends. No snippet measures across a cut.
 
     Args:
-        drive: as it was collected.
+        measured: as it was collected.
         sources: frames of a snippet besides its target.
         cuts: frames that show another place than the frame before.
         map_poses: poses by the maps of keyframes of the drive.
@@ -45,17 +56,18 @@ def interpolate_gaps(
     Raises:
         SlamError: no snippet was measured, so there is no motion to extrapolate.
     """
-    count = len(drive)
-    if not drive.snippets:
-        why = next(iter(drive.unusable.values()), "the sequence is too short")
+    count = len(measured)
+    if not measured.snippets:
+        why = next(iter(measured.unusable.values()), "the sequence is too short")
         raise SlamError(f"no {sources + 1} usable frames in a row among {count}: {why}")
-    new = set(range(count)).difference(drive.unusable, drive.repeated)
-    raw = network_steps(drive.snippets)
-    calibration = calibrate_network(raw, _poses(drive.steps), np.ones(count))
+    new = set(range(count)).difference(measured.unusable, measured.repeated)
+    raw = network_steps(measured.snippets)
+    calibration = calibrate_network(raw, _poses(measured.steps), np.ones(count))
     by_network = calibration.scaled(raw)
-    frozen, steps = _without_frozen(by_network, drive.steps, map_poses, drive.repeated, new)
-    frames = drive.unusable | dict.fromkeys(frozen, "the image stands still while the camera moves")
-    trusted = [snippet for snippet in drive.snippets if _is_trusted(snippet, frozen, cuts)]
+    frozen, steps = _without_frozen(by_network, measured.steps, map_poses, measured.repeated, new)
+    why = "the image stands still while the camera moves"
+    frames = measured.unusable | dict.fromkeys(frozen, why)
+    trusted = [snippet for snippet in measured.snippets if _is_trusted(snippet, frozen, cuts)]
     single = (pose for pose in _poses(steps) if pose.to_index == pose.from_index + 1)
     by_image = {pose.from_index: pose.T_from_to for pose in single}
     # snippets of frozen images alone are still the best estimate available
@@ -70,15 +82,12 @@ def interpolate_gaps(
         if len(over) > 1 and set(loose).issuperset(over):
             motion |= dict.fromkeys(over, equal_step(pose.T_from_to, len(over)))
     typical = float(np.median([np.linalg.norm(T[:3, 3]) for T in known.values()]))
-    return replace(
-        drive,
-        snippets=_filled(drive.snippets, _completed(raw, range(count - 1)), count, sources),
-        trusted=trusted,
-        motions=list(steps.values()),
-        interpolated=dict(sorted(frames.items())),
-        gap_steps=[_guess(k, motion[k], typical) for k in loose],
-        views=[view for view in drive.views if view.index not in frames],
-        keyframes=[keyframe for keyframe in drive.keyframes if keyframe.index not in frames],
+    return Filled(
+        steps,
+        _filled(measured.snippets, _completed(raw, range(count - 1)), count, sources),
+        trusted,
+        dict(sorted(frames.items())),
+        [_guess(k, motion[k], typical) for k in loose],
     )
 
 

@@ -174,16 +174,12 @@ class GpsFixes:
             weights = precision * np.minimum(1.0, _HUBER_K / np.maximum(whitened, 1e-9))
         return T_enu_world
 
-    def locate(
-        self, T_world_camera: FloatArray, scale: ScaleEstimate | Failed
-    ) -> Location | Failed:
-        """Where a trajectory ``(N, 4, 4)`` lies on the earth; a failure is logged, as that of its scale was.
+    def locate(self, T_world_camera: FloatArray) -> Location | Failed:
+        """Where a trajectory ``(N, 4, 4)`` in metres lies on the earth; a failure is logged.
 
         Raises:
             SlamError: the fixes contradict the path, and all lengths are theirs.
         """
-        if isinstance(scale, Failed):
-            return scale
         T_enu_world = self.align(T_world_camera)
         if not isinstance(T_enu_world, Failed):
             distances = np.linalg.norm(self.offsets(T_enu_world @ T_world_camera)[:, :2], axis=1)

@@ -29,7 +29,7 @@ from slam.config.sections import ScaleConfig, ScaleMode
 from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.road import RoadStep
-from slam.frontend.visual.motion import Motion, links, triangulated
+from slam.frontend.visual.motion import Motion, links
 from slam.geometry.robust import mad_sigma, median, running_median
 from slam.geometry.se3 import FloatArray, path_distance
 from slam.runtime.errors import Failed, SlamError
@@ -153,15 +153,15 @@ def find_scale(
         drive: completed.
         lidar_steps: steps by LiDAR, metres, of mode lidar.
     """
-    motions = triangulated(drive.steps)
+    motions = drive.triangulated
     frames = len(drive)
     height = camera_height_m if mode == "camera-height" else None
     if mode == "lidar":
         height = height_by_lidar(lidar_steps, drive) or camera_height_m
     unit = 1.0 if height is None else height
     absolute = _absolute_lengths(drive.road_steps, unit, lidar_steps if mode == "lidar" else ())
-    by_planes = scale_from_road(drive.roads, unit)
-    prior_unit = _prior_unit(drive.roads, motions, absolute, by_planes, unit)
+    by_planes = scale_from_road(drive.measured.roads, unit)
+    prior_unit = _prior_unit(drive.measured.roads, motions, absolute, by_planes, unit)
     steps = links(motions, frames)
     evidence = gather_evidence(steps, drive.steps, absolute, prior_unit)
     if not isinstance(by_planes, Failed):
@@ -232,10 +232,10 @@ def height_by_lidar(lidar_steps: Sequence[RelativePose], drive: Drive) -> float 
     roads = drive.road_steps
     heights = [metres[ends] / roads[ends].length_heights for ends in roads if ends in metres]
     if not heights:
-        for ends, motion in triangulated(drive.steps).items():
+        for ends, motion in drive.triangulated.items():
             if ends not in metres:
                 continue
-            plane = drive.roads[ends[0]]
+            plane = drive.measured.roads[ends[0]]
             if not isinstance(plane, Failed):
                 heights.append(metres[ends] / motion.length_unscaled * plane)
     return float(np.median(heights)) if heights else None

@@ -162,3 +162,10 @@ def umeyama(points_a: FloatArray, points_b: FloatArray, with_scale: bool) -> Sim
     variance_b = (centred_b**2).sum() / len(points_b)
     scale = float(singular @ sign / variance_b) if with_scale and variance_b > 0 else 1.0
     return Similarity(scale, R_a_b, mean_a - scale * R_a_b @ mean_b)
+
+
+def equal_step(T_a_b: FloatArray, n: int) -> FloatArray:
+    """One of n equal steps from a to b: the transform ``(4, 4)`` whose n-th power is ``T_a_b``."""
+    rotation_vector = Rotation.from_matrix(T_a_b[:3, :3]).as_rotvec() / n
+    powers = Rotation.from_rotvec(np.arange(n)[:, None] * rotation_vector).as_matrix()
+    return from_rotation_vector(rotation_vector, np.linalg.solve(powers.sum(axis=0), T_a_b[:3, 3]))

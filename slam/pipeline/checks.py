@@ -6,9 +6,10 @@ import logging
 
 from slam.config.sections import SlamConfig
 from slam.frames import Mask, Sequence, runs
-from slam.frontend.drive import DOUBLED, Drive, named
+from slam.frontend.drive import DOUBLED, Drive
 from slam.frontend.image_gate import ImageGate
 from slam.frontend.lidar_odometry import has_scans
+from slam.frontend.measured import named
 from slam.frontend.scale import known_frames, resolve_mode
 from slam.runtime.errors import SlamError
 from slam.sequences.recording import GrowingSequence
@@ -114,7 +115,7 @@ def warn_of_doubts(drive: Drive) -> None:
     if doubled:
         logger.warning("of %d frames %s: %s", len(doubled), DOUBLED, named(doubled))
     end = len(drive) - 1
-    for first, last in runs(drive.repeated):
+    for first, last in runs(drive.measured.repeated):
         if last == end and end not in drive.interpolated:
             logger.warning(
                 "frames %d to %d, the last ones, repeat frame %d: the camera is taken to stand; if the video "

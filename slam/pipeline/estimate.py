@@ -41,25 +41,6 @@ _STREET_DEPTH_M = 15.0  # median depth of a street
 
 
 @dataclass(frozen=True)
-class Odometry:
-    """A completed drive, its factors in the unit of its scale, and ``T_world_camera`` ``(N, 4, 4)`` chained from them.
-
-    ``lidar_steps`` are the steps by LiDAR that agree with the images, ``agreements`` those of all sources.
-    """
-
-    drive: Drive
-    scale: Scale
-    factors: list[RelativePose]
-    T_world_camera: FloatArray
-    lidar_steps: Sequence[RelativePose]
-    agreements: Sequence[Agreement]
-
-    def views(self) -> list[View]:
-        """Those of the drive, their points in the unit of the trajectory."""
-        return [view.scaled(float(self.scale.per_frame[view.index])) for view in self.drive.views]
-
-
-@dataclass(frozen=True)
 class Estimate:
     """Trajectories with one row a frame, the factors and loops they fit, the graph, and the map once it is fused.
 
@@ -112,7 +93,7 @@ def fuse(
     )
     height, width = drive.keyframes[0].depth_unscaled.shape
     intrinsics = intrinsics.resized(width, height)
-    guess_sigma = _ROOM_SIGMA if drive.maps and config.depth.is_learned else None
+    guess_sigma = _ROOM_SIGMA if drive.by_keyframes and config.depth.is_learned else None
     depth_at = keyframe_depths(drive, scales, T_world_camera, intrinsics, decide, guess_sigma)
     mapping = config.mapping if estimate.scale.is_metric else fitted(config.mapping, drive, scales)
     tsdf_map = TsdfMap(mapping, intrinsics)
@@ -161,7 +142,7 @@ def keyframe_depths(
     keyframes, refiner, error = (
         drive.keyframes,
         None,
-        DepthError() if drive.maps else drive.depth_error,
+        DepthError() if drive.by_keyframes else drive.measured.depth_error,
     )
     if decide is not None:
         indices = [keyframe.index for keyframe in keyframes]

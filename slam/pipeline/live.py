@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -17,9 +17,9 @@ from erfsfm.common.readers.camera_file import HIGHEST_M, impossible
 from slam.config.sections import SlamConfig
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image, Intrinsics, Predictor
-from slam.frontend.completion import complete_drive
-from slam.frontend.drive import LAST_STEPS, frame_support
+from slam.frontend.drive import Drive, complete_drive
 from slam.frontend.factors import chain_odometry, make_factors
+from slam.frontend.measured import LAST_STEPS, Measured, frame_support
 from slam.frontend.scale import Scale, find_scale, resolve_mode
 from slam.geometry.se3 import FloatArray, apply, compose, invert
 from slam.loops.closure import LoopClosures
@@ -86,17 +86,17 @@ class LivePoses:
 
     def add(self, observer: Observer) -> list[LivePose]:
         """The frames that the observer has finished since the last call."""
-        drive = observer.drive
-        first, count = len(self._T_world_camera), len(drive)
+        measured = observer.measured
+        first, count = len(self._T_world_camera), len(measured)
         frames = range(first, count)
         unasked = {0, *(index for index in frames if self._step(observer, index))}
-        if drive.snippets and (self._unit is None or count // _UPDATE > first // _UPDATE):
+        if measured.snippets and (self._unit is None or count // _UPDATE > first // _UPDATE):
             self._solve(observer, count)
         unit = None if self.unit_name is None else self._unit
-        support = frame_support(frames, drive.motions[-LAST_STEPS * len(frames) :]).tolist()
+        support = frame_support(frames, measured.motions[-LAST_STEPS * len(frames) :]).tolist()
         poses: list[LivePose] = []
         for index, pose, share in zip(frames, self._T_world_camera[first:], support):
-            state = self._state(index in drive.unusable)
+            state = self._state(index in measured.unusable)
             support_of = None if index in unasked else share
             poses.append(LivePose(index, pose.copy(), state, unit, support_of))
         return poses
@@ -120,8 +120,8 @@ class LivePoses:
             return False
         before, by_keyframes, motion = (
             index - 1,
-            observer.keyframes.step(index),
-            observer.drive.last_step(index),
+            observer.tracker.pose(index),
+            observer.measured.last_step(index),
         )
         T_before_frame = None
         if by_keyframes is not None:
@@ -141,13 +141,13 @@ class LivePoses:
     def _solve(self, observer: Observer, count: int) -> None:
         """Poses of the window by its own measurements, from its first one on, or from the last settled one on."""
         first = max(count - _WINDOW, 0)
-        window = observer.drive.since(first)
-        if not window.snippets:
+        measured = observer.measured.since(first)
+        if not measured.snippets:
             return
-        by_keyframes = observer.keyframes.step(count - 1) is not None
+        by_keyframes = observer.tracker.pose(count - 1) is not None
         # keyframes know all lengths but their unit, which learned depth of the ground gives
-        roads_alone = replace(window, motions=[], road_steps={})
-        window = roads_alone if by_keyframes else complete_drive(window, self._sources)
+        roads_alone = Drive(Measured(roads=measured.roads))
+        window = roads_alone if by_keyframes else complete_drive(measured, self._sources)
         scale = find_scale(self._mode, self._camera_height_m, window, [])
         self.unit_name = scale.unit_name
         unit = float(np.median(scale.per_frame) if by_keyframes else scale.per_frame[-1])
@@ -319,9 +319,9 @@ class Slam:
             SlamError: as `SlamPipeline.solve`.
         """
         self._observer.flush()
-        if not self._observer.drive.snippets:
+        if not self._observer.measured.snippets:
             return LoopClosures(not_sought="there are too few usable frames")
-        estimate = self._pipeline.solve(self._observer.measured(), Recorder())
+        estimate = self._pipeline.solve(self._observer.finish(), Recorder())
         self._poses.correct(estimate.optimised.T_world_camera, estimate.scale)
         self._estimate = estimate
         return estimate.loops
@@ -345,7 +345,7 @@ class Slam:
         """
         estimate = self._solved()
         places = estimate.places(self._sequence.intrinsics)
-        if estimate.drive.maps:
+        if estimate.drive.by_keyframes:
             structure = PlaceStructure(places, OF_KEYFRAMES)
             of_views = [structure.points(row, learned=False) for row in range(len(places.views))]
         else:
@@ -387,7 +387,7 @@ class Slam:
         Of every ``stride``-th pixel. Without ``with_map`` no frame is kept.
         """
         self._observer.flush()
-        kept = (each for each in self._observer.drive.keyframes if each.index >= first)
+        kept = (each for each in self._observer.measured.keyframes if each.index >= first)
         camera, unit = self._sequence.intrinsics, self._poses.unit
         return {each.index: unit * each.cloud_unscaled(camera, stride) for each in kept}
 

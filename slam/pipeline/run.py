@@ -18,17 +18,18 @@ from erfsfm.mvs.fusion import DepthFusion
 from erfsfm.mvs.refine import Decide
 from slam.config.sections import SlamConfig
 from slam.formats.trajectory import Trajectory
-from slam.frames import Frame, GpsTrack, Predictor, RelativePose
+from slam.frames import Frame, GpsTrack, Predictor, RelativePose, View
 from slam.frames import Sequence as FrameSequence
 from slam.frontend import agreement
 from slam.frontend.agreement import Agreement
-from slam.frontend.completion import complete_drive
-from slam.frontend.drive import Drive
-from slam.frontend.factors import chain_odometry, chain_raw, make_factors
+from slam.frontend.drive import Drive, complete_drive
+from slam.frontend.factors import chain_odometry, make_factors
 from slam.frontend.fixed_mask import LEAST_IMAGES, FixedMask
 from slam.frontend.gps import GpsFixes, Location
 from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.lidar_odometry import LIDAR_SOURCE, LidarPath, lidar_path, usable_steps
+from slam.frontend.measured import Measured
+from slam.frontend.network_motion import chain_raw
 from slam.frontend.scale import (
     Scale,
     ScaleEstimate,
@@ -38,15 +39,14 @@ from slam.frontend.scale import (
     scale_from_distance,
     scale_from_reference,
 )
-from slam.frontend.visual.motion import triangulated
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures, close_loops
 from slam.mapping.depth import KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.pipeline.checks import require_possible, warn_of_doubts, warn_of_images
-from slam.pipeline.estimate import Estimate, Odometry, fuse
-from slam.pipeline.map_closure import close_maps
+from slam.pipeline.estimate import Estimate, fuse
+from slam.pipeline.map_closure import MapClosure, close_maps
 from slam.pipeline.observer import Observer
 from slam.runtime.errors import Failed, SequenceError, SlamError, attempt
 from slam.runtime.imports import import_open3d_beside
@@ -127,10 +127,10 @@ class SlamPipeline:
         if self._config.mapping.enabled:
             import_open3d_beside()
         with calling_on_signals(interrupt or self._interrupted.set):
-            observed = self._observe(recorder, frames)
-        self._leave_out_unseen(observed)
+            measured = self._observe(recorder, frames)
+        self._leave_out_unseen(measured)
         self._progress("loops and graph", 0, 1)
-        estimate = self.solve(observed, recorder)
+        estimate = self.solve(measured, recorder)
         warn_of_doubts(estimate.drive)
         self._progress("loops and graph", 1, 1)
         recorder.estimate(estimate)
@@ -140,7 +140,7 @@ class SlamPipeline:
             return estimate
         return mapped
 
-    def solve(self, observed: Drive, recorder: Recorder) -> Estimate:
+    def solve(self, measured: Measured, recorder: Recorder) -> Estimate:
         """Lengths, factors and loops of a drive, and the trajectory that fits them.
 
         An error in the search for loops costs the loops, one in the graph the loops and the graph: the optimised
@@ -153,9 +153,8 @@ class SlamPipeline:
         reference = None if true_poses is None else self._trajectory(true_poses)
         if reference is not None:
             recorder.trajectory("reference", reference)
-        with self._watch.stage("geometry"):
-            poses = keyframe_poses(observed.maps, self.sequence.intrinsics, self._seed)
-        drive = complete_drive(observed, self._predictor.sources, poses)
+        maps = self._maps(measured)
+        drive = complete_drive(measured, self._predictor.sources, maps.poses, maps.joins)
         network = self._trajectory(chain_raw(drive.snippets, len(drive)))
         recorder.trajectory("network", network)
         with self._watch.stage("lidar"):
@@ -163,41 +162,37 @@ class SlamPipeline:
         lidar_steps, agreements = self._compared(drive, lidar)
         with self._watch.stage("scale"):
             scale = find_scale(self.mode, self.sequence.camera_height_m, drive, lidar_steps)
-        odometry = self._odometry(drive, scale, lidar_steps, agreements)
-        recorder.trajectory("odometry", self._trajectory(odometry.T_world_camera))
-        with self._watch.stage("loops"):
-            closed = attempt("loop closure", lambda: self._closed(odometry, observed))
-        odometry, loops = (
-            (odometry, LoopClosures(not_sought=closed.reason))
-            if isinstance(closed, Failed)
-            else closed
+        factors = make_factors(drive, scale)
+        if self.mode in ("reference", "known", "gps"):
+            unit = self._unit(chain_odometry(factors, len(drive)))
+            agreements += self._height_by(unit, scale)
+            scale = scale.in_metres(unit)
+            if isinstance(unit, ScaleEstimate):
+                factors = [factor.scaled(unit.value) for factor in factors]
+        if self._config.lidar.factors and scale.is_metric:
+            factors += lidar_steps
+        T_odometry = chain_odometry(factors, len(drive))
+        recorder.trajectory("odometry", self._trajectory(T_odometry))
+        views = [view.scaled(float(scale.per_frame[view.index])) for view in drive.views]
+        loops = self._loops(maps, drive, scale, views, T_odometry)
+        location = self._located(T_odometry, scale)
+        solved = attempt(
+            "the pose graph", lambda: self._optimised(factors, loops, T_odometry, location)
         )
-        fixes = self._fixes
-        location = (
-            None
-            if fixes is None
-            else fixes.locate(odometry.T_world_camera, odometry.scale.estimate)
-        )
-        solved = attempt("the pose graph", lambda: self._optimised(odometry, loops, location))
         if isinstance(solved, Failed):
-            solved = (
-                solved,
-                odometry.T_world_camera,
-                LoopClosures(not_sought=solved.reason),
-                location,
-            )
+            solved = solved, T_odometry, LoopClosures(not_sought=solved.reason), location
         graph, T_optimised, loops, location = solved
-        agreements, confidence = self._confidence(odometry)
+        agreements, confidence = self._confidence(drive, scale, T_odometry, agreements)
         return Estimate(
             network=network,
-            odometry=self._trajectory(odometry.T_world_camera),
+            odometry=self._trajectory(T_odometry),
             optimised=self._trajectory(T_optimised),
             lidar=lidar,
             reference=reference,
-            drive=odometry.drive,
-            scale=odometry.scale,
-            factors=odometry.factors,
-            views=odometry.views(),
+            drive=drive,
+            scale=scale,
+            factors=factors,
+            views=views,
             loops=loops,
             graph=graph,
             location=location,
@@ -228,7 +223,7 @@ class SlamPipeline:
             )
         _ = self._decide
 
-    def _observe(self, recorder: Recorder, frames: Iterator[Frame] | None) -> Drive:
+    def _observe(self, recorder: Recorder, frames: Iterator[Frame] | None) -> Measured:
         """One pass over the frames, to its end or until it is interrupted."""
         total = len(self.sequence)
         ahead = read_ahead(partial(read_frame, self.sequence), range(total))
@@ -242,13 +237,13 @@ class SlamPipeline:
                 self._progress("frames", index + 1, total)
                 if self._interrupted.is_set():
                     break
-            measured = observer.measured()
+            measured = observer.finish()
             warn_of_images(observer.gate, measured.fixed)
             return measured
 
-    def _leave_out_unseen(self, observed: Drive) -> None:
+    def _leave_out_unseen(self, measured: Measured) -> None:
         """After an interrupted pass the sequence is what was seen."""
-        seen, total = len(observed), len(self.sequence)
+        seen, total = len(measured), len(self.sequence)
         if seen == total:
             return
         if seen <= self._predictor.sources:
@@ -260,36 +255,30 @@ class SlamPipeline:
         self.sequence = self.sequence.cut(0, seen)
         self.require_possible()
 
-    def _odometry(
-        self,
-        drive: Drive,
-        scale: Scale,
-        lidar_steps: Sequence[RelativePose],
-        agreements: Sequence[Agreement],
-    ) -> Odometry:
-        """Factors of a drive and the odometry chained from them, in the final unit, which the mode may find first."""
-        if self.mode in ("reference", "known", "gps"):
-            unit = self._unit(chain_odometry(make_factors(drive, scale), len(drive)))
-            if (
-                isinstance(unit, ScaleEstimate)
-                and isinstance(scale.estimate, ScaleEstimate)
-                and not scale.is_metric
-            ):
-                name, height, spread = (
-                    f"scale.mode={self.mode}",
-                    self.sequence.camera_height_m,
-                    scale.estimate.spread,
-                )
-                agreements = [
-                    *agreements,
-                    agreement.of_height(name, unit.value, height, spread).required(),
-                ]
-            scale = scale.in_metres(unit)
-        as_factors = lidar_steps if self._config.lidar.factors and scale.is_metric else ()
-        factors = make_factors(drive, scale, as_factors)
-        return Odometry(
-            drive, scale, factors, chain_odometry(factors, len(drive)), lidar_steps, agreements
-        )
+    def _maps(self, measured: Measured) -> MapClosure:
+        """Poses by the maps of keyframes, closed by their loops."""
+        camera, maps = self.sequence.intrinsics, measured.maps
+        with self._watch.stage("geometry"):
+            poses = keyframe_poses(maps, camera, self._seed)
+        if not (maps and self._config.loops.enabled):
+            return MapClosure(poses)
+        with self._watch.stage("loops"):
+            closed = attempt("loop closure", lambda: close_maps(maps, poses, camera, self._seed))
+        if isinstance(closed, Failed):
+            return MapClosure(poses, LoopClosures(not_sought=closed.reason))
+        return closed
+
+    def _height_by(self, unit: ScaleEstimate | Failed, scale: Scale) -> list[Agreement]:
+        """How the camera's height by the unit agrees with the stated one, where the road is seen.
+
+        Raises:
+            SlamError: it contradicts it.
+        """
+        if isinstance(unit, Failed) or isinstance(scale.estimate, Failed) or scale.is_metric:
+            return []
+        name, stated_m = f"scale.mode={self.mode}", self.sequence.camera_height_m
+        height = agreement.of_height(name, unit.value, stated_m, scale.estimate.spread)
+        return [height.required()]
 
     def _unit(self, T_odometry: FloatArray) -> ScaleEstimate | Failed:
         """Metres per unit of an odometry, by what the mode knows of the drive."""
@@ -300,28 +289,41 @@ class SlamPipeline:
             return self._fixes.scale(T_odometry)
         return scale_from_distance(T_odometry, sequence.stamps, self._config.scale)
 
-    def _closed(self, odometry: Odometry, observed: Drive) -> tuple[Odometry, LoopClosures]:
-        """The loops of a drive, and its odometry, which that of closed maps replaces."""
-        camera, config, seed = self.sequence.intrinsics, self._config.loops, self._seed
-        if not (observed.maps and config.enabled):
-            views, is_metric = odometry.views(), odometry.scale.is_metric
-            return odometry, close_loops(
-                views, odometry.T_world_camera, camera, config, is_metric, seed
-            )
-        closure = close_maps(observed.maps, odometry.drive.map_poses, camera, seed)
-        if closure.loops.accepted:
-            drive = complete_drive(observed, self._predictor.sources, closure.poses, closure.joins)
-            odometry = self._odometry(
-                drive, odometry.scale, odometry.lidar_steps, odometry.agreements
-            )
-        return odometry, closure.closures(odometry.scale)
+    def _loops(
+        self,
+        maps: MapClosure,
+        drive: Drive,
+        scale: Scale,
+        views: Sequence[View],
+        T_odometry: FloatArray,
+    ) -> LoopClosures:
+        """The loops of closed maps, or those among the views of a drive."""
+        config = self._config.loops
+        if drive.by_keyframes and config.enabled:
+            return maps.closures(scale)
+        arguments = self.sequence.intrinsics, config, scale.is_metric, self._seed
+        with self._watch.stage("loops"):
+            loops = attempt("loop closure", lambda: close_loops(views, T_odometry, *arguments))
+        return LoopClosures(not_sought=loops.reason) if isinstance(loops, Failed) else loops
+
+    def _located(self, T_odometry: FloatArray, scale: Scale) -> Location | Failed | None:
+        """Where an odometry in metres lies on the earth; None without a GPS track."""
+        if self._fixes is None:
+            return None
+        if isinstance(scale.estimate, Failed):
+            return scale.estimate
+        return self._fixes.locate(T_odometry)
 
     def _optimised(
-        self, odometry: Odometry, loops: LoopClosures, location: Location | Failed | None
+        self,
+        factors: Sequence[RelativePose],
+        loops: LoopClosures,
+        T_odometry: FloatArray,
+        location: Location | Failed | None,
     ) -> tuple[PoseGraph | Failed, FloatArray, LoopClosures, Location | Failed | None]:
         """The graph, its trajectory ``(N, 4, 4)``, the loops that agree with it, and where it lies on the earth."""
-        graph, T_odometry, in_graph = PoseGraph(), odometry.T_world_camera, self._config.gps.factors
-        graph.add_relative(*odometry.factors, *(loop.measured for loop in loops.accepted))
+        graph, in_graph = PoseGraph(), self._config.gps.factors
+        graph.add_relative(*factors, *(loop.measured for loop in loops.accepted))
         if isinstance(location, Location) and in_graph:
             positions = location.fixes.at_frames(location.T_enu_world, T_odometry)
             graph.add_positions(*positions, location.T_enu_world)
@@ -332,7 +334,7 @@ class SlamPipeline:
         if isinstance(location, Location) and in_graph:
             location = replace(location, T_enu_world=graph.T_fixed_world)
         elif isinstance(location, Location):
-            location = location.fixes.locate(T_optimised, odometry.scale.estimate)
+            location = location.fixes.locate(T_optimised)
         return graph, T_optimised, loops.without(graph.dropped), location
 
     def _mapped(self, estimate: Estimate, recorder: Recorder) -> Estimate:
@@ -342,14 +344,14 @@ class SlamPipeline:
 
     def _compared(
         self, drive: Drive, lidar: LidarPath | Failed | None
-    ) -> tuple[Sequence[RelativePose], list[Agreement]]:
+    ) -> tuple[list[RelativePose], list[Agreement]]:
         """Steps by LiDAR unless the images contradict them, and LiDAR and depth from elsewhere beside the images.
 
         Raises:
             SlamError: lengths by LiDAR alone, or depth from elsewhere, are wrong.
         """
         steps = usable_steps(lidar, are_needed=self.mode == "lidar")
-        by_lidar = [agreement.of_steps(LIDAR_SOURCE, steps, triangulated(drive.steps))]
+        by_lidar = [agreement.of_steps(LIDAR_SOURCE, steps, drive.triangulated)]
         if (height := height_by_lidar(steps, drive)) is not None:
             by_lidar.append(
                 agreement.of_height(LIDAR_SOURCE, height, self.sequence.camera_height_m, 0.0)
@@ -361,26 +363,27 @@ class SlamPipeline:
         source = self._config.depth.source
         if (
             source != "network"
-            and (by_depth := agreement.of_depth(source, drive.depth_error)) is not None
+            and (by_depth := agreement.of_depth(source, drive.measured.depth_error)) is not None
         ):
             compared.append(by_depth.required())
         return [] if worst is not None and worst.is_wrong else steps, compared
 
-    def _confidence(self, odometry: Odometry) -> tuple[list[Agreement], float | Failed]:
+    def _confidence(
+        self, drive: Drive, scale: Scale, T_odometry: FloatArray, by_sources: Sequence[Agreement]
+    ) -> tuple[list[Agreement], float | Failed]:
         """Agreements of all sources and of the images, and what follows from them."""
-        drive, scale, by_sources = odometry.drive, odometry.scale, list(odometry.agreements)
+        by_sources, camera = list(by_sources), self.sequence.intrinsics
         if self._fixes is not None and (by_gps := self._fixes.agreement) is not None:
             # why it is not used was said
             by_sources.append(by_gps if by_gps.is_wrong else by_gps.said())
         needs_road = scale.unit in ("metres", "camera heights")
-        of_images = agreement.of_images(
-            drive, self.sequence.intrinsics, scale.contradicted, needs_road
-        )
-        if not drive.maps:
-            of_images.append(agreement.of_directions(odometry.T_world_camera))
+        of_images = agreement.of_images(drive, camera, scale.contradicted, needs_road)
+        if not drive.by_keyframes:
+            of_images.append(agreement.of_directions(T_odometry))
         trusted = [*(each for each in by_sources if not each.is_wrong), *of_images]
-        focal_sigma = self.sequence.intrinsics.focal_sigma
-        sure = agreement.confidence(trusted, scale.is_metric, bool(drive.maps), focal_sigma)
+        sure = agreement.confidence(
+            trusted, scale.is_metric, drive.by_keyframes, camera.focal_sigma
+        )
         return [*by_sources, *of_images], sure
 
     @cached_property

@@ -115,7 +115,9 @@ def _sequence(result: Estimate, sequence: FrameSequence) -> records.SequenceMetr
         doubled=_stretches(dict.fromkeys(drive.doubled, DOUBLED)),
         unreadable_scans=_stretches(scans),
         segments=[records.Stretch(**asdict(segment)) for segment in drive.segments],
-        fixed_share=_NOTHING_FIXED if drive.fixed is None else float(drive.fixed.mean()),
+        fixed_share=_NOTHING_FIXED
+        if drive.measured.fixed is None
+        else float(drive.measured.fixed.mean()),
     )
 
 
@@ -128,7 +130,9 @@ def _motion(result: Estimate) -> records.MotionMetrics | Failed:
     window = min(_TOP_SPEED_S, span)
     begins = seconds[seconds <= seconds[-1] - window]
     ahead = np.interp(begins + window, seconds, path) - path[: len(begins)]
-    standing = [each for each in result.drive.motions if each.relative_pose.source == STILL_SOURCE]
+    standing = [
+        each for each in result.drive.steps.values() if each.relative_pose.source == STILL_SOURCE
+    ]
     steps = {each.ends for each in standing if each.ends[1] - each.ends[0] == 1}
     return records.MotionMetrics.of(
         path=float(path[-1]),
@@ -260,10 +264,10 @@ def _loops(found: LoopClosures) -> records.LoopMetrics:
 def _tracking(result: Estimate) -> records.TrackingMetrics | Failed:
     """Keyframes, their maps, and what became of them."""
     drive = result.drive
-    if not drive.maps:
+    if not drive.by_keyframes:
         return Failed("this drive has no map of keyframes: it is measured from step to step")
     return records.TrackingMetrics(
-        keyframes=sum(len(segment.keyframes) for segment in drive.maps),
+        keyframes=sum(len(segment.keyframes) for segment in drive.measured.maps),
         maps=len(set(drive.map_poses.component.values())),
         located_frames=len(drive.map_poses.segments),
         events=[records.Event(**asdict(event)) for event in drive.events],
@@ -272,7 +276,10 @@ def _tracking(result: Estimate) -> records.TrackingMetrics | Failed:
 
 def _depth_error(result: Estimate) -> list[dict[str, float | None]] | Failed:
     """Bias and sigma of learned depth over distance at the end of the drive, in the unit of the trajectory."""
-    curve, unit = result.drive.depth_error.curve(), float(np.median(result.scale.per_frame))
+    curve, unit = (
+        result.drive.measured.depth_error.curve(),
+        float(np.median(result.scale.per_frame)),
+    )
     if not curve:
         return Failed("no step triangulated corners with learned depth")
     return [

@@ -81,7 +81,7 @@ def round_trip(street: Rendered) -> Estimate:
 @pytest.mark.slow
 def test_image_geometry_and_graph_reduce_the_error_of_the_network(round_trip: Estimate) -> None:
     assert len(round_trip.optimised) == 250
-    sources = [motion.relative_pose.source for motion in round_trip.drive.motions]
+    sources = [motion.relative_pose.source for motion in round_trip.drive.steps.values()]
     assert sources.count(ESSENTIAL_SOURCE) > 200
     assert ate(round_trip.network, round_trip) == pytest.approx(
         0.94, rel=0.2

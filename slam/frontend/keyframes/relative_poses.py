@@ -13,9 +13,8 @@ from itertools import pairwise
 import numpy as np
 
 from slam.frames import KEYFRAME_SOURCE, LOOP_SOURCE, Ends, Intrinsics, RelativePose
-from slam.frontend.keyframes.floor import units_by_floor
-from slam.frontend.keyframes.learned_units import learned_unit
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe, TrackIds
+from slam.frontend.keyframes.units import learned_unit, units_by_floor
 from slam.frontend.visual.two_view import CORNER_CORRELATION
 from slam.geometry.multiview import MIN_POINTS, resect
 from slam.geometry.se3 import FloatArray, invert

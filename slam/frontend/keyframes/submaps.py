@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import KEYFRAME_SOURCE, Intrinsics, RelativePose
-from slam.frontend.keyframes.learned_units import learned_units
 from slam.frontend.keyframes.local_map import (
     OUTLIER_PX,
     LocalMap,
@@ -27,6 +26,7 @@ from slam.frontend.keyframes.local_map import (
     TrackedKeyframe,
     TrackIds,
 )
+from slam.frontend.keyframes.units import learned_units
 from slam.geometry.multiview import MIN_POINTS
 from slam.geometry.se3 import FloatArray, apply, chain, invert
 

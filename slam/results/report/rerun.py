@@ -12,7 +12,7 @@ import numpy as np
 
 from slam.formats.trajectory import Trajectory
 from slam.frames import Intrinsics
-from slam.frontend.drive import Drive
+from slam.frontend.measured import Measured
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.estimate import Estimate
@@ -91,7 +91,7 @@ class Viewer:
         self._stream.spawn()
         self._stream.log("world", self._rr.ViewCoordinates.RDF, static=True)
 
-    def show(self, index: int, drive: Drive, newest: LivePose) -> None:
+    def show(self, index: int, measured: Measured, newest: LivePose) -> None:
         """A frame at its pose; its image and depth where it is a keyframe."""
         rr, stream, T = self._rr, self._stream, newest.T_world_camera
         stream.set_time("frame", sequence=index)
@@ -100,7 +100,7 @@ class Viewer:
             "world/path", rr.LineStrips3D([np.array(self._positions[-2000:])], colors=[_PATH])
         )
         stream.log("world/camera", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
-        keyframe = drive.keyframes[-1] if drive.keyframes else None
+        keyframe = measured.keyframes[-1] if measured.keyframes else None
         if keyframe is None or index - keyframe.index > 1 or newest.unit is None:
             return
         image, depth = keyframe.image, newest.unit * keyframe.depth_unscaled

@@ -13,8 +13,9 @@ import pytest
 from erfsfm.common.command_line import Terminal
 from slam.frames import Intrinsics, RelativePose
 from slam.frontend import agreement
-from slam.frontend.drive import Drive, Segment, frame_support
+from slam.frontend.drive import Drive, Segment
 from slam.frontend.lidar_odometry import LidarPath, lidar_steps
+from slam.frontend.measured import Measured, frame_support
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.self_calibration import DepthError, FocalLength
 from slam.geometry import se3
@@ -101,23 +102,24 @@ def driven(
 ) -> float:
     """The confidence of a drive by its images."""
     poses = [RelativePose(k, k + 1, T, np.full(6, 0.01), "essential") for k, T in enumerate(STEPS)]
+    steps = {}
+    for k, pose in enumerate(poses):
+        steps[pose.ends] = Motion(pose, 1e-4 * np.eye(6), support=0.1 if k < weak else support)
     drive = Drive(
-        motions=[
-            Motion(pose, 1e-4 * np.eye(6), support=0.1 if k < weak else support)
-            for k, pose in enumerate(poses)
-        ],
+        Measured(
+            roads=[Failed("not asked")] * (FRAMES + 1), focal_length=FocalLength(1e6, -1e6 * focal)
+        ),
+        steps=steps,
         road_steps=dict.fromkeys([pose.ends for pose in poses[:on_road]]),
-        roads=[Failed("not asked")] * (FRAMES + 1),
         segments=[Segment(k, k, "another place") for k in range(segments)],
-        focal_length=FocalLength(1e6, -1e6 * focal),
     )
     camera = replace(CAMERA, focal_sigma=focal_sigma)
     ends = [pose.ends for pose in poses[:contradicted]]
     found = agreement.of_images(drive, camera, ends, needs_road=True)
-    steps = STEPS.copy()
-    steps[:aside, :3, 3] = [0.9, 0.0, 0.0]
+    T_steps = STEPS.copy()
+    T_steps[:aside, :3, 3] = [0.9, 0.0, 0.0]
     sure = agreement.confidence(
-        [*found, agreement.of_directions(se3.chain(steps))], is_metric=True, is_carried=False
+        [*found, agreement.of_directions(se3.chain(T_steps))], is_metric=True, is_carried=False
     )
     assert isinstance(sure, float)
     return sure

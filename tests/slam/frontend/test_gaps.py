@@ -10,9 +10,9 @@ import pytest
 from oracle import snippets_of
 
 from slam.frames import RelativePose, SnippetPoses
-from slam.frontend.drive import Drive
-from slam.frontend.factors import chain_raw
-from slam.frontend.gaps import INTERPOLATED_SOURCE, interpolate_gaps
+from slam.frontend.gaps import INTERPOLATED_SOURCE, Filled, interpolate_gaps
+from slam.frontend.measured import Measured
+from slam.frontend.network_motion import chain_raw
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert
 from slam.runtime.errors import Failed, SlamError
@@ -30,22 +30,24 @@ def measured(T_world_camera: FloatArray, first: int, last: int) -> Motion:
     return Motion(RelativePose(first, last, T_from_to, np.full(6, 0.01), "essential"))
 
 
-def closed(T_world_camera: FloatArray, unusable: set[int], *steps: Motion) -> Drive:
+def closed(T_world_camera: FloatArray, unusable: set[int], *steps: Motion) -> Filled:
     reasons = dict.fromkeys(unusable, "black")
     return interpolate_gaps(
         collected(snippets_of(T_world_camera, unusable=unusable), steps, unusable=reasons), 4
     )
 
 
-def collected(snippets: list[SnippetPoses], steps: Iterable[Motion] = (), **others: Any) -> Drive:
+def collected(
+    snippets: list[SnippetPoses], steps: Iterable[Motion] = (), **others: Any
+) -> Measured:
     roads = [Failed("not drawn")] * COUNT
-    return Drive(snippets=snippets, motions=list(steps), roads=roads, **others)
+    return Measured(snippets=snippets, motions=list(steps), roads=roads, **others)
 
 
 def test_a_drive_without_gaps_stays_as_it_was() -> None:
     snippets, steps = snippets_of(steady()), [measured(steady(), 3, 4)]
     found = interpolate_gaps(collected(snippets, steps), 4)
-    assert found.snippets == found.trusted == snippets and found.motions == steps
+    assert found.snippets == found.trusted == snippets and list(found.steps.values()) == steps
     assert found.gap_steps == [] and found.interpolated == {}
 
 
@@ -135,7 +137,7 @@ def drifting() -> FloatArray:
     )
 
 
-def repeating(frozen: bool) -> tuple[Drive, FloatArray]:
+def repeating(frozen: bool) -> tuple[Filled, FloatArray]:
     """Ten repeated images: the camera moved, or stood."""
     T_steps = np.tile(STEP, (COUNT - 1, 1, 1))
     if not frozen:

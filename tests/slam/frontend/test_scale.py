@@ -13,6 +13,7 @@ import pytest
 from slam.config.sections import ScaleConfig
 from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
+from slam.frontend.measured import Measured
 from slam.frontend.road import RoadStep
 from slam.frontend.scale import (
     Scale,
@@ -65,7 +66,7 @@ def measured(
     steps=SINGLE,
 ) -> tuple[Drive, list[RelativePose]]:
     """A straight drive; ``bias`` makes the learned road lie too near, the first ``lidar`` steps have scans."""
-    motions = [Motion(step(ends, UNIT, "essential"), np.eye(6)) for ends in steps]
+    motions = {ends: Motion(step(ends, UNIT, "essential"), np.eye(6)) for ends in steps}
     plane = bias * HEIGHT_M * UNIT if planes else Failed("dark")
     roads = (
         {ends: RoadStep(metres(ends) / height_m * DOWN, np.eye(3), DOWN, 0.06) for ends in steps}
@@ -73,7 +74,7 @@ def measured(
         else {}
     )
     scans = [step(ends, 1.0, "lidar") for ends in SINGLE[:lidar]]
-    return Drive(roads=[plane] * FRAMES, motions=motions, road_steps=roads), scans
+    return Drive(Measured(roads=[plane] * FRAMES), motions, roads), scans
 
 
 def find(
@@ -111,10 +112,10 @@ def test_the_road_in_the_image_outweighs_the_learned_road(mode, unit_m, planes):
 
 def test_a_car_taken_for_the_road_for_half_the_drive_is_left_out():
     drive, scans = measured()
-    drive.road_steps |= {
-        ends: replace(drive.road_steps[ends], plane=0.1 * metres(ends) * DOWN)
-        for ends in SINGLE[:30]
-    }
+    roads = dict(drive.road_steps)
+    for ends in SINGLE[:30]:
+        roads[ends] = replace(roads[ends], plane=0.1 * metres(ends) * DOWN)
+    drive = replace(drive, road_steps=roads)
     scale = find("camera-height", (drive, scans))
     assert_lengths(scale, TRUE_M, rtol=0.03)
     for length in scale.lengths.values():
@@ -166,7 +167,10 @@ def test_lengths_by_learned_depth_alone_have_the_unit_at_their_first_frames():
     steps = [(k, k + 3) for k in range(0, FRAMES - 1, 3)]
     drifting = np.linspace(1.0, 1.1, FRAMES)
     planes = [HEIGHT_M * UNIT / unit for unit in drifting]
-    scale = find("camera-height", (replace(measured(road=False, steps=steps)[0], roads=planes), []))
+    scale = find(
+        "camera-height",
+        (replace(measured(road=False, steps=steps)[0], measured=Measured(roads=planes)), []),
+    )
     assert scale.per_frame[-1] > 1.03 * scale.per_frame[0]
     for ends in steps:
         assert scale.lengths[ends].value == pytest.approx(
@@ -201,7 +205,8 @@ def test_a_later_estimate_scales_everything_and_a_failure_nothing():
 def test_a_floor_seen_now_and_then_gives_no_metric_unit(share: float, unit: str) -> None:
     drive, scans = measured(road=False)
     seen = int(share * FRAMES)
-    drive = replace(drive, roads=[*drive.roads[:seen], *[Failed("a table")] * (FRAMES - seen)])
+    roads = [*drive.measured.roads[:seen], *[Failed("a table")] * (FRAMES - seen)]
+    drive = replace(drive, measured=Measured(roads=roads))
     scale = find("none", (drive, scans), None)
     assert scale.unit == scale.unit_name == unit
     assert isinstance(scale.estimate, ScaleEstimate) and scale.estimate.frames_used == seen

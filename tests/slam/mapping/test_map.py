@@ -4,8 +4,8 @@ import pytest
 from slam.config.sections import MappingConfig
 from slam.formats.ply import read_ply
 from slam.frames import Frame, Intrinsics
-from slam.frontend import drive
-from slam.frontend.drive import Keyframe
+from slam.frontend import measured
+from slam.frontend.measured import Keyframe
 from slam.geometry import se3
 from slam.mapping import submap, surface
 from slam.mapping.depth import KeyframeDepth
@@ -89,7 +89,7 @@ def test_one_wall_lands_where_the_camera_saw_it():
 
 
 def test_thinned_keyframes_keep_the_geometry(monkeypatch):
-    monkeypatch.setattr(drive, "MAP_WIDTH_PX", 70)
+    monkeypatch.setattr(measured, "MAP_WIDTH_PX", 70)
     monkeypatch.setattr(surface, "_LEAST_TRIANGLES", 10)
     spill_file = SpillFile()
     thinned = CAMERA.resized(70, round(CAMERA.height * 70 / CAMERA.width))

@@ -10,7 +10,8 @@ import pytest
 from erfsfm.mvs.fusion import DepthFusion
 from erfsfm.mvs.refine import Decide, Measurement, RefinedDepth
 from slam.frames import Frame, Intrinsics
-from slam.frontend.drive import Drive, Keyframe
+from slam.frontend.drive import Drive
+from slam.frontend.measured import Keyframe, Measured
 from slam.mapping.depth import KeyframeDepth
 from slam.pipeline.estimate import keyframe_depths
 from slam.runtime.errors import Failed
@@ -31,10 +32,8 @@ def depths(
     ]
     wall = np.full((32, 64), 2.5, np.float32)
     wall[24:] = 0  # as where an image shows what is fixed to its camera
-    drive = Drive(
-        keyframes=[Keyframe.of(frame, wall, spill_file) for frame in frames],
-        roads=[Failed("no road")] * FRAMES,
-    )
+    keyframes = [Keyframe.of(frame, wall, spill_file) for frame in frames]
+    drive = Drive(Measured(keyframes=keyframes, roads=[Failed("no road")] * FRAMES))
     T_world_camera = np.tile(np.eye(4), (FRAMES, 1, 1))
     T_world_camera[:, 0, 3] = step * np.arange(FRAMES)
     scale = np.full(FRAMES, 2.0)

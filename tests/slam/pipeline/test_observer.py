@@ -18,8 +18,8 @@ from slam.config.sections import SlamConfig, load_config
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import Frame
 from slam.frontend import tracking
-from slam.frontend.drive import Drive
 from slam.frontend.gaps import INTERPOLATED_SOURCE
+from slam.frontend.measured import Measured
 from slam.frontend.tracking import LONGEST_STEP
 from slam.frontend.visual.odometry import STILL_SOURCE
 from slam.geometry import se3
@@ -235,14 +235,14 @@ def test_an_undamaged_drive_has_no_interpolated_frames(caplog: pytest.LogCapture
     assert result.drive.doubled == [] and "exposure" not in caplog.text
 
 
-def observe(frames: int, damage: Damage, bad: range, *overrides: str) -> Drive:
+def observe(frames: int, damage: Damage, bad: range, *overrides: str) -> Measured:
     """So many frames of a damaged drive."""
     sequence = Damaged(street(), damage, bad)
     config = config_with("mapping.enabled=false", "visual_odometry.enabled=false", *overrides)
     with Observer(oracle_of(sequence), sequence.intrinsics, config, Stopwatch()) as observer:
         for index in range(frames):
             observer.add(index, read_frame(sequence, index))
-        return observer.measured()
+        return observer.finish()
 
 
 def test_missing_images_never_end_a_run_and_unreadable_ones_do() -> None:
@@ -277,7 +277,7 @@ def test_flushing_after_each_frame_measures_the_same_as_going_on(stride: int) ->
             going_on.add(index, frame)
             flushed.add(index, Frame(index, frame.stamp, frame.image))
             flushed.flush()
-            assert len(flushed.measured()) == flushed.frames == going_on.frames == index + 1
+            assert len(flushed.finish()) == flushed.frames == going_on.frames == index + 1
         assert_same(going_on, flushed)
 
 
@@ -285,7 +285,7 @@ def assert_same(one: Observer, other: Observer) -> None:
     """Both have measured the same bytes, of every kind."""
     one.flush()
     other.flush()
-    first, second = one.drive, other.drive
+    first, second = one.measured, other.measured
     assert (
         len(first.relative_rotations) > 10 and len(first.road_steps) > 5 and len(first.steps) > 12
     )
@@ -341,7 +341,7 @@ def test_a_camera_that_moves_too_little_to_be_told_from_the_frame_before_does_no
     assert errors.max() < 0.03
     still = {
         motion.ends[1]
-        for motion in result.drive.motions
+        for motion in result.drive.steps.values()
         if motion.relative_pose.source == STILL_SOURCE
     }
     assert still.isdisjoint(range(FRAMES + 1))
@@ -367,9 +367,9 @@ def test_a_given_mask_joins_what_is_found() -> None:
     given[-4:], found[:, 0] = True, True
     with Observer(oracle_of(sequence), sequence.intrinsics, config_with(), Stopwatch()) as observer:
         observer.add(0, replace(sequence.frame(0), fixed=given))
-        assert observer.drive.fixed is given
+        assert observer.measured.fixed is given
         observer.fixed.mask = found
         observer.add(1, replace(sequence.frame(1), fixed=given))
-        fixed = observer.measured().fixed
+        fixed = observer.finish().fixed
     assert fixed is not None and fixed[-4:].all() and fixed[:, : given.shape[1] // 4].all()
     assert not fixed[:-4, given.shape[1] // 4 :].any()

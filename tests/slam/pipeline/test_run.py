@@ -22,9 +22,8 @@ from slam.config.sections import load_config
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.frames import Frame, GpsTrack, Image, Intrinsics, SnippetPoses
-from slam.frontend import drive
+from slam.frontend import measured
 from slam.frontend.gps import LocalFrame, Location
-from slam.frontend.visual.motion import triangulated
 from slam.frontend.visual.odometry import STILL_SOURCE
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
@@ -313,7 +312,7 @@ def test_zero_optical_flow_suppresses_the_noise_of_the_pose_network() -> None:
     noise = OracleNoise(np.deg2rad(0.3))
     options = ("visual_odometry.enabled=true",)
     result = run(still, *options, noise=noise)
-    assert {motion.relative_pose.source for motion in result.drive.motions} == {STILL_SOURCE}
+    assert {motion.relative_pose.source for motion in result.drive.steps.values()} == {STILL_SOURCE}
     rotation = [
         se3.rotation_angle(t.T_world_camera[:, :3, :3]).max()
         for t in (result.network, result.optimised)
@@ -325,7 +324,7 @@ def test_zero_optical_flow_suppresses_the_noise_of_the_pose_network() -> None:
 def test_images_without_corners_leave_only_network_factors() -> None:
     result = run(LevelRoad(turning(20)), "visual_odometry.enabled=true")
     assert len(result.drive.steps) == 0
-    pairs = [(first, second) for first, second, _ in result.drive.failures]
+    pairs = [(first, second) for first, second, _ in result.drive.measured.failures]
     assert pairs == [(k, k + 1) for k in range(19)]
     np.testing.assert_allclose(result.optimised.T_world_camera, turning(20), atol=1e-3)
 
@@ -388,13 +387,12 @@ def test_images_reach_geometry_map_and_report(
         ("map", k, 13) for k in range(1, 14)
     ]
     seen = result.drive
-    assert len(seen.steps) > 15 and len(seen.steps) + len(seen.failures) == STREET - 1
+    assert len(seen.steps) > 15 and len(seen.steps) + len(seen.measured.failures) == STREET - 1
     assert {f.ends for f in result.factors if f.source == "network"} == {
         (k, k + 1) for k in range(STREET - 1)
     }
-    assert (
-        len(seen.road_steps) > 10 and result.scale.lengths.keys() == triangulated(seen.steps).keys()
-    )
+    assert len(seen.road_steps) > 10
+    assert result.scale.lengths.keys() == seen.triangulated.keys()
     assert result.map is not None and result.map.statistics()["triangles"] > 5000
     assert {"read", "depth network", "pose network", "geometry", "graph", "map"} <= set(
         result.stopwatch.stages
@@ -415,7 +413,7 @@ def test_without_metres_the_map_is_as_fine_as_the_scene_is_near(street: Simulate
 def test_depth_is_thinned_for_the_map(
     street: SimulatedSequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(drive, "MAP_WIDTH_PX", 104)
+    monkeypatch.setattr(measured, "MAP_WIDTH_PX", 104)
     oracle = OraclePredictor(street.reference, lambda k: np.full((64, 208), 10.0))
     settings = load_config(None, ["visual_odometry.enabled=false"])
     seen = SlamPipeline(street, oracle, settings).run().drive

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from slam.frames import Intrinsics
-from slam.frontend.keyframes.learned_units import learned_unit
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
 from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.keyframes.submaps import parts_of
+from slam.frontend.keyframes.units import learned_unit
 from slam.geometry.se3 import FloatArray, apply, from_rotation_vector, invert, rotation_angle
 
 CAMERA = Intrinsics(640, 480, 500.0, 500.0, 319.5, 239.5)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from slam.frontend.completion import find_cuts, find_segments
-from slam.frontend.drive import Segment
+from slam.frontend.drive import Segment, find_cuts, find_segments
 
 STEPS = [(k, k + 1) for k in range(9)]
 

@@ -9,14 +9,20 @@ from oracle import OraclePredictor
 
 from erfsfm.common.processes import opencv_threads
 from slam import Slam
-from slam.config.sections import KeyframesConfig, LoopsConfig, MappingConfig, SlamConfig
+from slam.config.sections import (
+    KeyframesConfig,
+    LoopsConfig,
+    MappingConfig,
+    SlamConfig,
+    VisualOdometryConfig,
+)
 from slam.frames import DepthMap, Frame, RelativePose
-from slam.frontend.completion import complete_drive
-from slam.frontend.drive import Drive
+from slam.frontend.drive import Drive, complete_drive
+from slam.frontend.front_end import MotionTracker, choose
 from slam.frontend.keyframes.relative_poses import keyframe_poses
+from slam.frontend.measured import FrontEnd, Measured
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector
-from slam.pipeline.front_end_choice import FrontEnd, KeyframeTracking, choose
 from slam.pipeline.observer import Observer
 from slam.runtime.errors import Failed
 from slam.runtime.stopwatch import Stopwatch
@@ -26,10 +32,12 @@ KEYFRAMES_ALONE = SlamConfig(
     loops=LoopsConfig(enabled=False),
     mapping=MappingConfig(enabled=False),
 )
-CONFIG = SlamConfig()
+KEYFRAMES_WITH_LOOPS = SlamConfig(
+    keyframes=KeyframesConfig(use="always"), visual_odometry=VisualOdometryConfig(enabled=False)
+)
 
 
-def steps(count: int, scatter: float, seconds: float = 0.1) -> Drive:
+def steps(count: int, scatter: float, seconds: float = 0.1) -> Measured:
     """Steps of a camera height each."""
     rng = np.random.default_rng(0)
     motions = []
@@ -39,40 +47,40 @@ def steps(count: int, scatter: float, seconds: float = 0.1) -> Drive:
         )
         pose = RelativePose(k, k + 1, T, np.ones(6), "essential")
         motions.append(Motion(pose, np.eye(6), seconds=seconds))
-    return Drive(motions=motions, roads=[1.0] * count)
+    return Measured(motions=motions, roads=[1.0] * count)
 
 
 @pytest.mark.parametrize(
     ("count", "scatter", "seconds", "front_end"),
     [
-        *((60, 0.02, 0.1, "steps"), (60, 1.0, 0.1, "keyframes"), (60, 0.02, 1.0, "keyframes")),
-        *(
-            (12, 0.02, 0.1, "steps"),
-            (12, 1.0, 0.1, "keyframes"),
-            (12, 0.02, 1.0, "both"),
-            (8, 0.02, 0.1, "both"),
-        ),
+        (60, 0.02, 0.1, FrontEnd.STEPS),
+        (60, 1.0, 0.1, FrontEnd.KEYFRAMES),
+        (60, 0.02, 1.0, FrontEnd.KEYFRAMES),
+        (12, 0.02, 0.1, FrontEnd.STEPS),
+        (12, 1.0, 0.1, FrontEnd.KEYFRAMES),
+        (12, 0.02, 1.0, None),
+        (8, 0.02, 0.1, None),
     ],
 )
 def test_a_vehicle_goes_the_same_way_for_a_while_and_fast(
-    count: int, scatter: float, seconds: float, front_end: FrontEnd
+    count: int, scatter: float, seconds: float, front_end: FrontEnd | None
 ) -> None:
     drive = steps(count, scatter, seconds)
-    assert choose(KeyframesConfig(), None, drive) == front_end
+    assert choose(KeyframesConfig(), None, drive) is front_end
     drive.roads[:] = [Failed("no road")] * count
-    assert choose(KeyframesConfig(), None, drive) != "steps"
+    assert choose(KeyframesConfig(), None, drive) is not FrontEnd.STEPS
 
 
 def test_a_known_camera_height_and_a_setting_choose() -> None:
     by_hand = steps(60, 1.0)
-    assert choose(KeyframesConfig(), 1.65, by_hand) == "steps"
-    assert choose(KeyframesConfig(use="never"), None, by_hand) == "steps"
-    assert choose(KeyframesConfig(use="always"), 1.65, by_hand) == "keyframes"
+    assert choose(KeyframesConfig(), 1.65, by_hand) is FrontEnd.STEPS
+    assert choose(KeyframesConfig(use="never"), None, by_hand) is FrontEnd.STEPS
+    assert choose(KeyframesConfig(use="always"), 1.65, by_hand) is FrontEnd.KEYFRAMES
 
 
 def completed(observer: Observer) -> Drive:
-    drive = observer.measured()
-    return complete_drive(drive, 4, keyframe_poses(drive.maps, room.INTRINSICS))
+    measured = observer.finish()
+    return complete_drive(measured, 4, keyframe_poses(measured.maps, room.INTRINSICS))
 
 
 @pytest.mark.parametrize("stands", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -94,7 +102,7 @@ def test_steps_are_measured_where_keyframes_have_no_pose(stands: bool) -> None:
         drive = completed(observer)
     started = min(drive.map_poses.segments)
     assert started < 10 and len(drive.map_poses.segments) == 40 - len(blank) - started
-    late = [motion.ends for motion in observer.drive.motions if motion.ends[0] > 19]
+    late = [motion.ends for motion in observer.measured.motions if motion.ends[0] > 19]
     assert late == [(23, 26)]
     assert set(drive.interpolated) == {*blank, *(() if stands else repeated)}
 
@@ -117,9 +125,9 @@ def test_depth_is_predicted_for_keyframes_alone(interrupted: tuple[int, ...]) ->
         for k, T in enumerate(truth):
             observer.add(k, room.frame(k, T))
             if k in interrupted:
-                observer.measured()
+                observer.finish()
         drive = completed(observer)
-    keyframes = drive.maps[-1].keyframes
+    keyframes = drive.measured.maps[-1].keyframes
     assert all(
         np.isfinite(keyframe.learned_depth).any()
         for keyframe in keyframes
@@ -154,11 +162,11 @@ def test_observations_stay_while_frames_follow() -> None:
     with Observer(oracle, room.INTRINSICS, KEYFRAMES_ALONE, Stopwatch()) as observer:
         for k in range(26):
             observer.add(k, room.frame(k, truth[k]))
-        drive = observer.measured()
+        drive = observer.finish()
         before = pickle.dumps(drive)
         for k in range(26, 40):
             observer.add(k, room.frame(k, truth[k]))
-        assert len(observer.measured()) == 40
+        assert len(observer.finish()) == 40
     assert drive.maps and drive.events and pickle.dumps(drive) == before
 
 
@@ -178,29 +186,34 @@ def test_what_keyframes_measured_stays_when_the_camera_is_lost() -> None:
     assert np.linalg.norm(after[-1, :3, 3] - before[-1, :3, 3]) > 0.0
 
 
-def tracked(
-    truth: FloatArray, unseen: Sequence[int], sparse: Sequence[int] = ()
-) -> KeyframeTracking:
+def tracked(truth: FloatArray, unseen: Sequence[int], sparse: Sequence[int] = ()) -> Measured:
     """After some frames, of which some show another scene, and some have no depth."""
-    tracking = KeyframeTracking(KeyframesConfig(use="always"), CONFIG.loops, room.INTRINSICS, 0)
+    tracker = MotionTracker(
+        KEYFRAMES_WITH_LOOPS,
+        room.INTRINSICS,
+        Measured(),
+        Stopwatch(),
+        seen=lambda frame: pytest.fail("steps are not measured"),
+        on_keyframe=lambda frame: None,
+    )
     for k, T in enumerate(truth):
         frame = room.frame(k, T, 9 if k in unseen else 0)
-        tracking.follow(frame)
+        tracker.add([], frame)
         if k not in sparse:
-            tracking.learn(frame, room.depth_map(T))
-    return tracking
+            tracker.learn(frame, room.depth_map(T))
+    return tracker.finish()
 
 
 def test_after_a_short_loss_the_camera_is_found_again_in_its_map() -> None:
     walked = room.there_and_back(110, roll=0.4, closer=0.3)
     truth = np.concatenate([walked[:60], walked[82:]])
-    tracking = tracked(truth, range(60, 66))
-    _, lost, found = tracking.events
+    measured = tracked(truth, range(60, 66))
+    _, lost, found = measured.events
     assert (lost.event, lost.frame) == ("lost", 60)
     assert (found.event, found.frame) == ("relocalised", 66)
     assert found.other is not None
     assert found.other < 40
-    poses = keyframe_poses(tracking.maps(Drive()), room.INTRINSICS)
+    poses = keyframe_poses(measured.maps, room.INTRINSICS)
     assert set(poses.segments) == {*range(60), *range(66, 88)}
     position, rotation = room.errors(poses, truth)
     assert position < 0.01

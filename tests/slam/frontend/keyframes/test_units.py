@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.frontend.keyframes.floor import units_by_floor
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
+from slam.frontend.keyframes.units import units_by_floor
 from slam.geometry.se3 import from_rotation_vector, invert
 
 HEIGHT_M = 1.5

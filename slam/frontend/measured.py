@@ -1,0 +1,203 @@
+"""What was measured of a drive, collected frame by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from itertools import takewhile
+from typing import Any, TypeVar
+
+import numpy as np
+
+from slam.frames import (
+    DepthMap,
+    Ends,
+    Frame,
+    Image,
+    Intrinsics,
+    Mask,
+    SnippetPoses,
+    TrackingEvent,
+    View,
+    resized_depth,
+    runs,
+)
+from slam.frontend.keyframes.local_map import LocalMap
+from slam.frontend.road import RoadStep
+from slam.frontend.visual.motion import Motion, RelativeRotation, Steps
+from slam.frontend.visual.self_calibration import DepthError, FocalLength
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import Failed
+from slam.runtime.memory import SpilledArray, SpillFile
+
+T = TypeVar("T")
+
+MAP_WIDTH_PX = 416  # of the depth that is fused: that of the networks
+_MOST_NAMED = 10  # stretches of frames in a sentence
+LAST_STEPS = 4  # in which the step to one of the last frames is looked up
+
+
+class FrontEnd(Enum):
+    """What measures the camera's motion."""
+
+    STEPS = "steps from frame to frame"
+    KEYFRAMES = "keyframes and their maps"
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """A frame for fusion, thinned and spilled to disk."""
+
+    index: int
+    spilled_image: SpilledArray
+    spilled_depth: SpilledArray
+
+    @classmethod
+    def of(cls, frame: Frame, depth_unscaled: DepthMap, spill_file: SpillFile) -> Keyframe:
+        """Thin a frame and its depth, of any size, to at most ``MAP_WIDTH_PX`` and spill both."""
+        height, width = frame.image.shape[:2]
+        ratio = min(MAP_WIDTH_PX / width, 1.0)
+        size = (max(round(width * ratio), 1), max(round(height * ratio), 1))
+        image, depth = frame.resized(*size).image, resized_depth(depth_unscaled, *size)
+        return cls(frame.index, spill_file.put(image), spill_file.put(depth))
+
+    @property
+    def image(self) -> Image:
+        """``(h, w, 3)``."""
+        return self.spilled_image.read()
+
+    @property
+    def depth_unscaled(self) -> DepthMap:
+        """``(h, w)``."""
+        return self.spilled_depth.read()
+
+    def cloud_unscaled(self, intrinsics: Intrinsics, stride: int) -> FloatArray:
+        """Points ``(M, 3)`` in its camera, of every ``stride``-th pixel; intrinsics of any size."""
+        depth = self.depth_unscaled
+        camera = intrinsics.resized(*depth.shape[::-1])
+        v, u = np.mgrid[: camera.height : stride, : camera.width : stride].reshape(2, -1)
+        points = camera.rays(np.column_stack([u, v])) * depth[v, u, None]
+        return np.asarray(points[points[:, 2] > 0])
+
+
+@dataclass
+class Measured:
+    """What was measured of a drive so far, in the networks' unit of length; all of it grows at its end alone.
+
+    Attributes:
+        snippets: by the pose network.
+        motions: all steps that image geometry measured.
+        road_steps: lengths of steps by the road's homography.
+        relative_rotations: rotations across several steps.
+        failures: steps that image geometry could not measure, with the reason.
+        roads: of every frame, the camera's height over the ground plane.
+        views: of frames among which loops are sought.
+        keyframes: frames for the map.
+        unusable: frames without a measurement, with the reason.
+        repeated: frames with the image of the one before.
+        moving: those of them just before which the camera moved.
+        fixed: the part of the last image that is fixed to the camera.
+
+    Known once the front end has finished:
+        depth_error: of learned depth, as the steps have it.
+        focal_length: the one that corners show, as the steps have it.
+        maps: of keyframes; a drive measured by steps alone has none.
+        events: what became of the maps.
+    """
+
+    snippets: list[SnippetPoses] = field(default_factory=list)
+    motions: list[Motion] = field(default_factory=list)
+    road_steps: dict[Ends, RoadStep] = field(default_factory=dict)
+    relative_rotations: list[RelativeRotation] = field(default_factory=list)
+    failures: list[tuple[int, int, str]] = field(default_factory=list)
+    roads: list[float | Failed] = field(default_factory=list)
+    views: list[View] = field(default_factory=list)
+    keyframes: list[Keyframe] = field(default_factory=list)
+    unusable: dict[int, str] = field(default_factory=dict)
+    repeated: list[int] = field(default_factory=list)
+    moving: list[int] = field(default_factory=list)
+    fixed: Mask | None = None
+    depth_error: DepthError = field(default_factory=DepthError)
+    focal_length: FocalLength = field(default_factory=FocalLength)
+    maps: Sequence[LocalMap] = ()
+    events: Sequence[TrackingEvent] = ()
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.roads)
+
+    @property
+    def front_end(self) -> FrontEnd:
+        """What measured the camera's motion: keyframes, where they have a map."""
+        return FrontEnd.KEYFRAMES if self.maps else FrontEnd.STEPS
+
+    @property
+    def steps(self) -> Steps:
+        """The steps of image geometry; a later one replaces an earlier one between the same frames."""
+        return {motion.ends: motion for motion in self.motions}
+
+    def last_step(self, index: int) -> Motion | None:
+        """The step to one of the last frames, where image geometry measured it."""
+        return next(
+            (motion for motion in self.motions[-LAST_STEPS:] if motion.ends[1] == index), None
+        )
+
+    def copy(self) -> Measured:
+        """A snapshot: what is measured later is added to one of both alone."""
+        own: dict[str, Any] = {
+            name: each.copy() for name, each in vars(self).items() if isinstance(each, list | dict)
+        }
+        return replace(self, **own)
+
+    def since(self, first: int) -> Measured:
+        """The measurements from frame ``first`` on, which becomes frame 0; without views and keyframes.
+
+        It takes as long as there are frames since, however long the drive.
+        """
+
+        def last(items: Iterable[T], start: Callable[[T], int]) -> list[T]:
+            """The items that begin in the window, of items in order of time that may span a few frames."""
+            return list(takewhile(lambda item: start(item) >= first, items))[::-1]
+
+        def renumbered(ends: Ends) -> Ends:
+            return ends[0] - first, ends[1] - first
+
+        window = Measured(roads=self.roads[first:])
+        for snippet in last(reversed(self.snippets), lambda snippet: min(snippet.sources)):
+            target = snippet.target - first
+            sources = tuple(source - first for source in snippet.sources)
+            window.snippets.append(replace(snippet, target=target, sources=sources))
+        for motion in last(reversed(self.motions), lambda motion: motion.ends[0]):
+            from_index, to_index = renumbered(motion.ends)
+            pose = replace(motion.relative_pose, from_index=from_index, to_index=to_index)
+            window.motions.append(replace(motion, relative_pose=pose))
+        for ends, step in last(reversed(self.road_steps.items()), lambda item: item[0][0]):
+            window.road_steps[renumbered(ends)] = step
+        for turn in last(reversed(self.relative_rotations), lambda turn: turn.ends[0]):
+            window.relative_rotations.append(replace(turn, ends=renumbered(turn.ends)))
+        for earlier, later, why in last(reversed(self.failures), lambda failure: failure[0]):
+            window.failures.append((*renumbered((earlier, later)), why))
+        for frame, why in last(reversed(self.unusable.items()), lambda item: item[0]):
+            window.unusable[frame - first] = why
+        for frame in last(reversed(self.repeated), lambda frame: frame):
+            window.repeated.append(frame - first)
+        return window
+
+
+def frame_support(frames: range, motions: Iterable[Motion]) -> FloatArray:
+    """The share of the corners that fit the motion to each frame ``(N,)``, 0 without one; the first has the next's."""
+    found: dict[int, float] = {}
+    for motion in motions:
+        found[motion.ends[1]] = max(found.get(motion.ends[1], 0.0), motion.support)
+    found[0] = found.get(1, 0.0)
+    return np.array([found.get(frame, 0.0) for frame in frames])
+
+
+def named(frames: Collection[int]) -> str:
+    """Stretches of frames in words, the first ten of them."""
+    found = runs(frames)
+    words = [
+        f"{first} to {last}" if last > first else str(first) for first, last in found[:_MOST_NAMED]
+    ]
+    return ", ".join(words) + ", ..." * (len(found) > _MOST_NAMED)

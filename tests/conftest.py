@@ -238,8 +238,8 @@ def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.Tes
 @pytest.fixture(scope="session")
 def kitti_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A KITTI odometry root with the one sequence ``sim``: 14 frames of simulated world 1001. Not to be changed."""
-    from slam.simulation.kitti_layout import write_kitti_root
     from slam.simulation.options import SimulationOptions
+    from slam.simulation.recording import write_kitti_root
     from slam.simulation.street import SimulatedStreet
 
     root = tmp_path_factory.mktemp("kitti") / "root"

@@ -30,7 +30,7 @@ from slam.results.report.figures import LOOKS, MapMesh, thinned_mesh
 from slam.results.report.page import narrowed
 from slam.runtime.files import MAP_MESH, REFERENCE, TRAJECTORIES
 from slam.runtime.imports import import_open3d
-from slam.sequences.catalogue import open_sequence
+from slam.simulation.recording import open_or_embedded
 
 WIDTH_PX = 1600
 SEAT_PX = 1280, 720
@@ -65,7 +65,7 @@ def main() -> None:
     arguments = parser.parse_args()
 
     folder = RunFolder.open(arguments.run)
-    sequence = open_sequence(arguments.dataset, arguments.sequence, None, None)
+    sequence = open_or_embedded(arguments.dataset, arguments.sequence, None, None)
     if arguments.seat is None:
         picture = overview(folder, sequence, DepthPosePredictor.from_weights(arguments.weights))
     else:

@@ -37,9 +37,9 @@ from slam.frontend.agreement import CONFIDENCE, share_right
 from slam.geometry.se3 import FloatArray
 from slam.results.folder import RunFolder
 from slam.runtime.errors import SlamError
-from slam.sequences.catalogue import SimulatedSequence, open_sequence
-from slam.simulation.kitti_layout import write_image, write_lines
+from slam.sequences.catalogue import open_sequence
 from slam.simulation.options import Hazard, SimulationOptions
+from slam.simulation.recording import SimulatedSequence, write_image, write_lines
 
 Image = NDArray[np.uint8]
 WORDS = (

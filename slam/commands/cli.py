@@ -356,8 +356,8 @@ def simulate(
 
     Example: erfsfm-slam simulate world --route grid --frames 600 --seed 600 --depth --lidar
     """
-    from slam.simulation.kitti_layout import simulated_world, write_kitti_root
     from slam.simulation.options import SimulationOptions
+    from slam.simulation.recording import simulated_world, write_kitti_root
 
     named = tuple(name.strip() for name in hazards.split(",") if name.strip())
     world = simulated_world(

@@ -30,7 +30,7 @@ from slam.results.folder import RunFolder, check_replaced
 from slam.results.metrics import CAMERA_HEIGHTS, METRES
 from slam.runtime.errors import RunError, SlamError
 from slam.runtime.files import ESTIMATE, MAP_CLOUD, MAP_MESH, PLACES, write_atomically
-from slam.sequences.catalogue import open_sequence
+from slam.simulation.recording import open_or_embedded
 
 logger = logging.getLogger(__name__)
 
@@ -299,7 +299,7 @@ def _recording(
     elif dataset is not None and camera is not None and not camera.exists():
         camera = None  # it may have moved with the images
     try:
-        sequence = open_sequence(dataset or place, recorded.get("sequence"), camera)
+        sequence = open_or_embedded(dataset or place, recorded.get("sequence"), camera)
     except (SlamError, ErfsfmError) as error:
         raise RunError(
             f"the images of {folder.path} are needed and not found ({error}); give --dataset ROOT"

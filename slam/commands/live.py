@@ -81,7 +81,7 @@ def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
         recorder = LiveRecorder(
             folder, pipeline, settings, provenance_of(request, prediction, sequence)
         )
-        poses = LivePoses(prediction.networks.sources, sequence.camera_height_m, settings)
+        poses = LivePoses(prediction.networks.sources, pipeline.unit)
         recorder.follow(sequence, poses, emit, viewer)
         try:
             # in a thread: the sequence's lock may be held by the code that is interrupted

@@ -70,9 +70,9 @@ from slam.runtime.files import (
 )
 from slam.runtime.imports import import_extra
 from slam.sequences.camera_file import AUTO, is_auto
-from slam.sequences.catalogue import open_sequence
 from slam.sequences.gps_track import read_gps
 from slam.sequences.recording import RecordedSequence
+from slam.simulation.recording import open_or_embedded
 
 logger = logging.getLogger(__name__)
 
@@ -355,14 +355,14 @@ def open_recording(request: RunRequest) -> RecordedSequence:
     """The recording; a camera that nobody states is found by its own images, and said in one line.
 
     Raises:
-        SequenceError: as `open_sequence`.
+        SequenceError: as `open_or_embedded`.
     """
     asked, place = request.camera, (request.dataset, request.sequence)
     try:
-        recording = open_sequence(*place, asked, request.frames, request.truth)
+        recording = open_or_embedded(*place, asked, request.frames, request.truth)
     except MissingCameraError:
         asked = AUTO
-        recording = open_sequence(*place, asked, request.frames, request.truth)
+        recording = open_or_embedded(*place, asked, request.frames, request.truth)
     camera = recording.camera
     if asked is None or not is_auto(asked) or not isinstance(camera, CameraFile):
         return recording

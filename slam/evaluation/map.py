@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial import cKDTree
 
+from slam.formats.ply import scene_of
 from slam.frames import Mask
 from slam.geometry.se3 import FloatArray, Similarity, apply, nearest_rotation, path_distance
 from slam.mapping.submap import moved_rows
 from slam.runtime.errors import Failed
 from slam.runtime.imports import import_open3d
 from slam.runtime.record import Count, Record, part
-from slam.simulation.world import scene_of
 
 Indices = NDArray[np.int64]
 

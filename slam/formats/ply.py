@@ -1,4 +1,4 @@
-"""Point clouds and triangle meshes as binary PLY files.
+"""Point clouds and triangle meshes: binary PLY files, and the scene in which rays meet triangles.
 
 On a full disk Open3D's writer prints a line for every vertex and reports success, so files are written here, with the
 same layout and bytes.
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import RunError
 from slam.runtime.files import write_atomically
+from slam.runtime.imports import import_open3d
 
 # that Open3D and we write
 _TYPES = {"double": "f8", "float": "f4", "uchar": "u1", "int": "i4", "uint": "u4"}
@@ -189,3 +190,17 @@ def _header(file: BinaryIO) -> dict[str, tuple[int, list[tuple[Any, ...]]]]:
             case ["property", kind, name]:
                 fields.append((name, f"<{_TYPES[kind]}"))
     raise ValueError("it ends within its header")
+
+
+def scene_of(vertices: NDArray[np.float32], triangles: NDArray[np.uint32]) -> Any:
+    """Open3D's scene of triangles ``(T, 3)`` between vertices ``(V, 3)``."""
+    open3d = import_open3d()
+    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(open3d.core.Tensor(vertices), open3d.core.Tensor(triangles))
+    return scene
+
+
+def distances(scene: Any, points: FloatArray) -> FloatArray:
+    """Distance from points ``(M, 3)`` to the nearest surface of a scene, ``(M,)``."""
+    tensor = import_open3d().core.Tensor(points.astype(np.float32))
+    return np.asarray(scene.compute_distance(tensor).numpy(), dtype=np.float64)

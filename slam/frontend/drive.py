@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -9,11 +10,13 @@ from functools import cached_property
 from slam.frames import Ends, RelativePose, SnippetPoses, TrackingEvent, View, runs
 from slam.frontend.gaps import interpolate_gaps
 from slam.frontend.keyframes.relative_poses import NO_MAPS, KeyframePoses
-from slam.frontend.measured import FrontEnd, Keyframe, Measured, frame_support
+from slam.frontend.measured import FrontEnd, Keyframe, Measured, frame_support, named
 from slam.frontend.road import RoadStep, with_slope
 from slam.frontend.rotations import smooth_rotations
 from slam.frontend.visual.motion import Motion, Steps, triangulated
 from slam.geometry.se3 import FloatArray
+
+logger = logging.getLogger(__name__)
 
 DOUBLED = "the image repeats the one before while the camera moves"
 _LONGEST_GAP = 30  # interpolated frames, after which the place is only guessed
@@ -193,3 +196,30 @@ def complete_drive(
         map_poses,
         sorted([*measured.events, *joins], key=lambda event: event.frame),
     )
+
+
+def warn_of_doubts(drive: Drive) -> None:
+    """Warn of gaps, of segments, whose places are guesses, and of a frozen end: did the camera stand there?"""
+    gaps, later, doubled = drive.interpolated, drive.segments[1:], drive.doubled
+    if gaps:
+        more = ", ..." if len(set(gaps.values())) > 1 else ""
+        logger.warning("frames %s are interpolated: %s%s", named(gaps), gaps[min(gaps)], more)
+    if later:
+        begins = named([segment.first for segment in later])
+        logger.warning(
+            "a new segment of the drive begins at frame %s (%s): its place relative to the frames before is a guess",
+            begins,
+            later[0].reason,
+        )
+    if doubled:
+        logger.warning("of %d frames %s: %s", len(doubled), DOUBLED, named(doubled))
+    end = len(drive) - 1
+    for first, last in runs(drive.measured.repeated):
+        if last == end and end not in drive.interpolated:
+            logger.warning(
+                "frames %d to %d, the last ones, repeat frame %d: the camera is taken to stand; if the video "
+                "froze, leave them out with --frames",
+                first,
+                last,
+                first - 1,
+            )

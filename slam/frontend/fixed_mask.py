@@ -11,6 +11,7 @@ image belongs to it.
 
 from __future__ import annotations
 
+import logging
 import math
 
 import cv2
@@ -49,6 +50,11 @@ _CHANGED = 0.002  # of the image: a mask that changes by less stays
 _MARGIN = np.ones((3, 3), np.uint8)  # corners beside a fixed pixel see a part of it
 
 _Layer = NDArray[np.float32]
+
+
+logger = logging.getLogger(__name__)
+
+_LEAST_STANDING, _MOST_STANDING = 0.02, 0.6  # of the image, of which a run says something
 
 
 class FixedMask:
@@ -127,6 +133,22 @@ class FixedMask:
         if not fixed.any():
             return None
         return np.asarray(cv2.dilate(fixed.view(np.uint8), _MARGIN), np.bool_)
+
+
+def warn_of_fixed(fixed: Mask | None) -> None:
+    """Warn of a part of the image that does not show the world."""
+    share = 0.0 if fixed is None else float(fixed.mean())
+    if share > _LEAST_STANDING:
+        logger.warning(
+            "%.0f %% of the image stand still while the camera moves (bars, a logo, the bonnet): no corner, depth or "
+            "road is taken from there",
+            100 * share,
+        )
+    if share > _MOST_STANDING:
+        logger.warning(
+            "little of the world is left: mount the camera so that it sees more of the road, or give a mask in "
+            "camera.yaml if the part was found wrongly"
+        )
 
 
 def _below_broad_edges(edges: NDArray[np.uint8], world: Mask, least_width: float) -> Mask:

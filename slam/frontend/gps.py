@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config.sections import GpsConfig, ScaleMode
+from slam.config.sections import GpsConfig
 from slam.formats.trajectory import nearest_stamps
 from slam.frames import GpsTrack
 from slam.frontend import agreement
@@ -54,19 +54,12 @@ class GpsFixes:
         agreement: of the fixes with the last path that was located by them.
     """
 
-    def __init__(
-        self, track: GpsTrack, frame_stamps: FloatArray, config: GpsConfig, mode: ScaleMode
-    ) -> None:
+    def __init__(self, track: GpsTrack, frame_stamps: FloatArray, config: GpsConfig) -> None:
         """The fixes of a track between the first and the last of the frames' stamps ``(N,)``.
 
         Raises:
-            SlamError: lengths are not in metres, or fewer than three fixes were taken during the
-                drive.
+            SlamError: fewer than three fixes were taken during the drive.
         """
-        if mode == "none":
-            raise SlamError(
-                "a GPS track is in metres: choose scale.mode=gps with it, or another mode in metres"
-            )
         shifted = track.stamps + config.offset_s
         inside = (shifted >= frame_stamps[0]) & (shifted <= frame_stamps[-1])
         if inside.sum() < _LEAST_FIXES:
@@ -89,7 +82,7 @@ class GpsFixes:
             np.sqrt(max(config.correlation_s / float(np.median(np.diff(self.stamps))), 1.0))
         )
         self.agreement: Agreement | None = None
-        self._frame_stamps, self._give_lengths = frame_stamps, mode == "gps"
+        self._frame_stamps = frame_stamps
 
     def scale(self, T_world_camera_unscaled: FloatArray) -> ScaleEstimate | Failed:
         """Metres per unit of an odometry ``(N, 4, 4)``: the median ratio of chords, so that outliers count little.
@@ -174,11 +167,11 @@ class GpsFixes:
             weights = precision * np.minimum(1.0, _HUBER_K / np.maximum(whitened, 1e-9))
         return T_enu_world
 
-    def locate(self, T_world_camera: FloatArray) -> Location | Failed:
+    def locate(self, T_world_camera: FloatArray, give_lengths: bool) -> Location | Failed:
         """Where a trajectory ``(N, 4, 4)`` in metres lies on the earth; a failure is logged.
 
         Raises:
-            SlamError: the fixes contradict the path, and all lengths are theirs.
+            SlamError: the fixes contradict the path, and ``give_lengths``: all are theirs.
         """
         T_enu_world = self.align(T_world_camera)
         if not isinstance(T_enu_world, Failed):
@@ -187,7 +180,7 @@ class GpsFixes:
             self.agreement = agreement.of_positions("GPS", distances, self.sigmas[:, 0], path_m)
             if not self.agreement.is_wrong:
                 return Location(self, T_enu_world)
-            if self._give_lengths:
+            if give_lengths:
                 raise SlamError(
                     f"{self.agreement}; give the track and gps.offset_s of this drive, or another scale.mode"
                 )

@@ -1,4 +1,4 @@
-"""The unit of a run and the lengths of its steps, by mode: camera height over the ground plane, LiDAR, a reference.
+"""The lengths of all steps of a run.
 
 A monocular step has a direction and no length. Three measurements give the length: points
 triangulated by two steps that share a frame give the ratio of both lengths; the road's homography
@@ -10,7 +10,7 @@ deviation ``b``, with ``t`` the duration of a step:
     x_k - x_{k-1} = log(t_k / t_{k-1})
 
 solved for the whole drive by robust least squares, whose matrix is banded
-(``docs/design/scale-and-lengths.md``). The mode decides which measurements are absolute.
+(``docs/design/scale-and-lengths.md``).
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
-from slam.config.sections import ScaleConfig, ScaleMode
+from slam.config.sections import ScaleMode
 from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.road import RoadStep
 from slam.frontend.visual.motion import Motion, links
 from slam.geometry.robust import mad_sigma, median, running_median
-from slam.geometry.se3 import FloatArray, path_distance
-from slam.runtime.errors import Failed, SlamError
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import Failed
 
 LengthUnit = Literal["metres", "camera heights", "no metric unit", "the networks' own unit"]
 
@@ -40,7 +40,6 @@ logger = logging.getLogger(__name__)
 # of the frames, half of which have learned depth; fewer see a floor or a table now and then
 _LEAST_ROAD = 1 / 3
 _MAX_CONTRADICTION = 2.5  # largest factor between a measured length and that by learned depth
-_REFERENCE_FRAMES = 50  # number of first frames that mode reference compares
 _REJECTION_SIGMAS = 3.0  # distance from the median beyond which a frame is left out
 MIN_FRAMES = 5  # least number of usable frames of a scale
 _SMOOTHING_FRAMES = 41  # window over which the scale of a frame is averaged, frames
@@ -136,30 +135,22 @@ class Scale:
 
 
 def find_scale(
-    mode: ScaleMode,
-    camera_height_m: float | None,
-    drive: Drive,
-    lidar_steps: Sequence[RelativePose],
+    mode: ScaleMode, height_m: float | None, drive: Drive, lidar_steps: Sequence[RelativePose] = ()
 ) -> Scale:
-    """All lengths of a run in metres, or in camera heights where the mode gives no metres.
+    """All lengths of a run in metres, or in camera heights where no height is known.
 
-    Modes none, reference, known and gps give none here. Without a road in most frames, the planes
-    that were found give no unit that means anything.
+    Without a road in most frames, the planes that were found give no unit that means anything.
 
     Args:
         mode: resolved.
-        camera_height_m: above the road, of mode camera-height; in mode lidar it stands in for the
-            one that the scans measure.
+        height_m: of the camera above the road; None where the mode knows none.
         drive: completed.
-        lidar_steps: steps by LiDAR, metres, of mode lidar.
+        lidar_steps: steps by LiDAR, metres, where these give all lengths.
     """
     motions = drive.triangulated
     frames = len(drive)
-    height = camera_height_m if mode == "camera-height" else None
-    if mode == "lidar":
-        height = height_by_lidar(lidar_steps, drive) or camera_height_m
-    unit = 1.0 if height is None else height
-    absolute = _absolute_lengths(drive.road_steps, unit, lidar_steps if mode == "lidar" else ())
+    unit = 1.0 if height_m is None else height_m
+    absolute = _absolute_lengths(drive.road_steps, unit, lidar_steps)
     by_planes = scale_from_road(drive.measured.roads, unit)
     prior_unit = _prior_unit(drive.measured.roads, motions, absolute, by_planes, unit)
     steps = links(motions, frames)
@@ -174,7 +165,7 @@ def find_scale(
     misfit = np.abs(evidence.absolute - np.log(solved.length))
     used = int(np.isfinite(misfit).sum())
     estimate = by_planes
-    is_metric = height is not None or (mode == "lidar" and len(lidar_steps) > 0)
+    is_metric = height_m is not None or len(lidar_steps) > 0
     named: LengthUnit = "metres" if is_metric else "camera heights"
     if used >= MIN_FRAMES:
         spread = mad_sigma(misfit[np.isfinite(misfit)])
@@ -226,32 +217,6 @@ def _prior_unit(
     return scale_track(roads, camera_height, by_planes)
 
 
-def height_by_lidar(lidar_steps: Sequence[RelativePose], drive: Drive) -> float | None:
-    """The camera's height from steps measured by LiDAR and the road, or else by learned planes; None without both."""
-    metres = {pose.ends: float(np.linalg.norm(pose.T_from_to[:3, 3])) for pose in lidar_steps}
-    roads = drive.road_steps
-    heights = [metres[ends] / roads[ends].length_heights for ends in roads if ends in metres]
-    if not heights:
-        for ends, motion in drive.triangulated.items():
-            if ends not in metres:
-                continue
-            plane = drive.measured.roads[ends[0]]
-            if not isinstance(plane, Failed):
-                heights.append(metres[ends] / motion.length_unscaled * plane)
-    return float(np.median(heights)) if heights else None
-
-
-def resolve_mode(
-    config: ScaleConfig, camera_height_m: float | None, has_gps: bool = False
-) -> ScaleMode:
-    """The mode, with ``auto`` resolved: camera-height where the height is known, else gps where there is, else none."""
-    if config.mode != "auto":
-        return config.mode
-    if camera_height_m is not None:
-        return "camera-height"
-    return "gps" if has_gps else "none"
-
-
 def scale_from_road(roads: Sequence[float | Failed], height: float = 1.0) -> ScaleEstimate | Failed:
     """Unit of the camera's ``height`` per unscaled length: metres, or camera heights where it is 1.
 
@@ -265,70 +230,6 @@ def scale_from_road(roads: Sequence[float | Failed], height: float = 1.0) -> Sca
     kept = logarithms[deviations <= _REJECTION_SIGMAS * mad_sigma(deviations) + 1e-12]
     spread = mad_sigma(kept - np.median(kept))
     return ScaleEstimate(float(np.exp(np.median(kept))), spread, len(kept))
-
-
-def scale_from_reference(
-    T_world_camera_unscaled: FloatArray, T_world_camera_true: FloatArray
-) -> ScaleEstimate | Failed:
-    """True path length over estimated path length of the first 50 frames."""
-    estimated = np.diff(path_distance(T_world_camera_unscaled[:_REFERENCE_FRAMES]))
-    true = np.diff(path_distance(T_world_camera_true[:_REFERENCE_FRAMES]))
-    if estimated.sum() <= 0 or true.sum() <= 0:
-        return Failed(f"the camera does not move within the first {_REFERENCE_FRAMES} frames")
-    value = float(true.sum() / estimated.sum())
-    moving = estimated > 0.1 * estimated.mean()
-    spread = float(np.std(true[moving] / estimated[moving] / value))
-    return ScaleEstimate(value, spread, len(estimated) + 1)
-
-
-def known_frames(config: ScaleConfig, stamps: FloatArray) -> tuple[int, int]:
-    """The two frames of mode known, at the frames' ``stamps`` ``(N,)``.
-
-    Raises:
-        SlamError: a frame or stamp outside the drive, or twice the same frame.
-    """
-    found = []
-    for end in config.known_between or ():
-        if isinstance(end, int):
-            index, inside = end, end < len(stamps)
-        else:
-            stamp = float(end.removesuffix("s"))
-            index = int(np.abs(stamps - stamp).argmin())
-            inside = bool(stamps[0] <= stamp <= stamps[-1])
-        if not inside:
-            raise SlamError(
-                f"scale.known_between names {end}, but the drive has frames 0 to {len(stamps) - 1} "
-                f"at {stamps[0]:.3f} to {stamps[-1]:.3f} s: choose two of these"
-            )
-        found.append(index)
-    first, second = found
-    if first == second:
-        raise SlamError(
-            f"scale.known_between names frame {first} twice: choose two frames with a distance between them"
-        )
-    return first, second
-
-
-def scale_from_distance(
-    T_world_camera_unscaled: FloatArray, stamps: FloatArray, config: ScaleConfig
-) -> ScaleEstimate | Failed:
-    """The known distance of two frames over their estimated distance.
-
-    Args:
-        T_world_camera_unscaled: poses of all frames ``(N, 4, 4)``.
-        stamps: of all frames ``(N,)``, seconds.
-        config: says which two frames, and how far they are apart.
-
-    Raises:
-        SlamError: a frame or stamp outside the drive, or twice the same frame.
-    """
-    first, second = known_frames(config, stamps)
-    apart = np.linalg.norm(
-        T_world_camera_unscaled[second, :3, 3] - T_world_camera_unscaled[first, :3, 3]
-    )
-    if config.known_m is None or not apart > 0:
-        return Failed(f"the camera does not move between frames {first} and {second}")
-    return ScaleEstimate(config.known_m / float(apart), 0.0, 2)
 
 
 def scale_track(

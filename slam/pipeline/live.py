@@ -20,7 +20,8 @@ from slam.frames import Frame, Image, Intrinsics, Predictor
 from slam.frontend.drive import Drive, complete_drive
 from slam.frontend.factors import chain_odometry, make_factors
 from slam.frontend.measured import LAST_STEPS, Measured, frame_support
-from slam.frontend.scale import Scale, find_scale, resolve_mode
+from slam.frontend.scale import Scale, find_scale
+from slam.frontend.scale_mode import Unit
 from slam.geometry.se3 import FloatArray, apply, compose, invert
 from slam.loops.closure import LoopClosures
 from slam.loops.places import PlaceStructure
@@ -61,10 +62,9 @@ class LivePoses:
     what follows the last frame that they located.
     """
 
-    def __init__(self, sources: int, camera_height_m: float | None, config: SlamConfig) -> None:
-        """Prepare for the first frame, by the ``sources`` of a snippet and the camera's height, None where unknown."""
-        self._sources, self._camera_height_m = sources, camera_height_m
-        self._mode = resolve_mode(config.scale, camera_height_m)
+    def __init__(self, sources: int, metric: Unit) -> None:
+        """Prepare for the first frame, by the ``sources`` of a snippet and the unit of the run."""
+        self._sources, self._metric = sources, metric
         self.unit_name: str | None = None  # of all lengths, None while unknown
         self._T_world_camera: list[FloatArray] = []
         self._unit: float | None = None  # of the mode per unscaled length, at the newest frame
@@ -148,7 +148,7 @@ class LivePoses:
         # keyframes know all lengths but their unit, which learned depth of the ground gives
         roads_alone = Drive(Measured(roads=measured.roads))
         window = roads_alone if by_keyframes else complete_drive(measured, self._sources)
-        scale = find_scale(self._mode, self._camera_height_m, window, [])
+        scale = find_scale(self._metric.mode, self._metric.height_m(window, ()), window)
         self.unit_name = scale.unit_name
         unit = float(np.median(scale.per_frame) if by_keyframes else scale.per_frame[-1])
         if self._unit is None:
@@ -202,7 +202,7 @@ class Slam:
         self._pipeline.require_possible()
         self._observer = self._pipeline.observer()
         self._is_closed = False
-        self._poses = LivePoses(predictor.sources, camera_height_m, config)
+        self._poses = LivePoses(predictor.sources, self._pipeline.unit)
         self._newest = LivePose(0, np.eye(4), "starting", None, None)
         self._estimate: Estimate | None = None
 

@@ -22,29 +22,21 @@ from slam.frames import Frame, GpsTrack, Predictor, RelativePose, View
 from slam.frames import Sequence as FrameSequence
 from slam.frontend import agreement
 from slam.frontend.agreement import Agreement
-from slam.frontend.drive import Drive, complete_drive
+from slam.frontend.drive import Drive, complete_drive, warn_of_doubts
 from slam.frontend.factors import chain_odometry, make_factors
-from slam.frontend.fixed_mask import LEAST_IMAGES, FixedMask
+from slam.frontend.fixed_mask import LEAST_IMAGES, FixedMask, warn_of_fixed
 from slam.frontend.gps import GpsFixes, Location
 from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.lidar_odometry import LIDAR_SOURCE, LidarPath, lidar_path, usable_steps
 from slam.frontend.measured import Measured
 from slam.frontend.network_motion import chain_raw
-from slam.frontend.scale import (
-    Scale,
-    ScaleEstimate,
-    find_scale,
-    height_by_lidar,
-    resolve_mode,
-    scale_from_distance,
-    scale_from_reference,
-)
+from slam.frontend.scale import Scale, ScaleEstimate, find_scale
+from slam.frontend.scale_mode import height_by_lidar, require_scans, unit_of
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures, close_loops
 from slam.mapping.depth import KeyframeDepth
 from slam.mapping.map import TsdfMap
-from slam.pipeline.checks import require_possible, warn_of_doubts, warn_of_images
 from slam.pipeline.estimate import Estimate, fuse
 from slam.pipeline.map_closure import MapClosure, close_maps
 from slam.pipeline.observer import Observer
@@ -101,7 +93,6 @@ class SlamPipeline:
         """
         self.sequence, self._predictor, self._config = sequence, predictor, config
         self._progress, self._seed, self._gps_track = progress, seed, gps_track
-        self.mode = resolve_mode(config.scale, sequence.camera_height_m, gps_track is not None)
         self._fixes: GpsFixes | None = None  # those of the GPS track during the drive
         self._watch = Stopwatch()
         self._interrupted = Event()
@@ -161,14 +152,16 @@ class SlamPipeline:
             lidar = lidar_path(self.sequence, self._progress)
         lidar_steps, agreements = self._compared(drive, lidar)
         with self._watch.stage("scale"):
-            scale = find_scale(self.mode, self.sequence.camera_height_m, drive, lidar_steps)
+            height_m = self.unit.height_m(drive, lidar_steps)
+            by_lidar = lidar_steps if self.unit.by_lidar else ()
+            scale = find_scale(self.unit.mode, height_m, drive, by_lidar)
         factors = make_factors(drive, scale)
-        if self.mode in ("reference", "known", "gps"):
-            unit = self._unit(chain_odometry(factors, len(drive)))
-            agreements += self._height_by(unit, scale)
-            scale = scale.in_metres(unit)
-            if isinstance(unit, ScaleEstimate):
-                factors = [factor.scaled(unit.value) for factor in factors]
+        if self.unit.metres is not None:
+            metres = self.unit.metres(chain_odometry(factors, len(drive)))
+            agreements += self._height_by(metres, scale)
+            scale = scale.in_metres(metres)
+            if isinstance(metres, ScaleEstimate):
+                factors = [factor.scaled(metres.value) for factor in factors]
         if self._config.lidar.factors and scale.is_metric:
             factors += lidar_steps
         T_odometry = chain_odometry(factors, len(drive))
@@ -214,13 +207,31 @@ class SlamPipeline:
         return Observer(self._predictor, self.sequence.intrinsics, *parts)
 
     def require_possible(self) -> None:
-        """Check that this run can succeed, and match its GPS track; as `checks.require_possible` and `GpsFixes`."""
-        shortest = self._predictor.sources + 1
-        require_possible(self.sequence, self._config, shortest, self._gps_track is not None)
-        if self._gps_track is not None:
-            self._fixes = GpsFixes(
-                self._gps_track, self.sequence.stamps, self._config.gps, self.mode
+        """Check that this run can succeed, and match its GPS track.
+
+        Raises:
+            SlamError: too few frames, or the sequence lacks what the configuration needs.
+        """
+        sequence, shortest, track = self.sequence, self._predictor.sources + 1, self._gps_track
+        if 0 < len(sequence) < shortest:
+            raise SlamError(
+                f"{sequence.name} has {len(sequence)} frames, and one snippet of these networks has {shortest}: "
+                "choose a longer range"
             )
+        if track is not None:
+            self._fixes = GpsFixes(track, sequence.stamps, self._config.gps)
+        self.unit = unit_of(self._config.scale, sequence, self._fixes)
+        if track is not None and not self.unit.gives_metres:
+            raise SlamError(
+                "a GPS track is in metres: choose scale.mode=gps with it, or another mode in metres"
+            )
+        if self._config.lidar.factors:
+            require_scans("lidar.factors=true", sequence)
+            if not self.unit.gives_metres:
+                raise SlamError(
+                    f"lidar.factors=true is in metres, and lengths of {sequence.name} are in camera heights: "
+                    "choose scale.mode=lidar or give a camera height"
+                )
         _ = self._decide
 
     def _observe(self, recorder: Recorder, frames: Iterator[Frame] | None) -> Measured:
@@ -238,7 +249,8 @@ class SlamPipeline:
                 if self._interrupted.is_set():
                     break
             measured = observer.finish()
-            warn_of_images(observer.gate, measured.fixed)
+            observer.gate.warn()
+            warn_of_fixed(measured.fixed)
             return measured
 
     def _leave_out_unseen(self, measured: Measured) -> None:
@@ -268,26 +280,17 @@ class SlamPipeline:
             return MapClosure(poses, LoopClosures(not_sought=closed.reason))
         return closed
 
-    def _height_by(self, unit: ScaleEstimate | Failed, scale: Scale) -> list[Agreement]:
-        """How the camera's height by the unit agrees with the stated one, where the road is seen.
+    def _height_by(self, metres: ScaleEstimate | Failed, scale: Scale) -> list[Agreement]:
+        """How the camera's height in metres agrees with the stated one, where the road is seen.
 
         Raises:
             SlamError: it contradicts it.
         """
-        if isinstance(unit, Failed) or isinstance(scale.estimate, Failed) or scale.is_metric:
+        if isinstance(metres, Failed) or isinstance(scale.estimate, Failed):
             return []
-        name, stated_m = f"scale.mode={self.mode}", self.sequence.camera_height_m
-        height = agreement.of_height(name, unit.value, stated_m, scale.estimate.spread)
+        name, stated_m = f"scale.mode={self.unit.mode}", self.sequence.camera_height_m
+        height = agreement.of_height(name, metres.value, stated_m, scale.estimate.spread)
         return [height.required()]
-
-    def _unit(self, T_odometry: FloatArray) -> ScaleEstimate | Failed:
-        """Metres per unit of an odometry, by what the mode knows of the drive."""
-        sequence = self.sequence
-        if self.mode == "reference" and sequence.reference is not None:
-            return scale_from_reference(T_odometry, sequence.reference)
-        if self.mode == "gps" and self._fixes is not None:
-            return self._fixes.scale(T_odometry)
-        return scale_from_distance(T_odometry, sequence.stamps, self._config.scale)
 
     def _loops(
         self,
@@ -312,7 +315,7 @@ class SlamPipeline:
             return None
         if isinstance(scale.estimate, Failed):
             return scale.estimate
-        return self._fixes.locate(T_odometry)
+        return self._fixes.locate(T_odometry, self.unit.by_gps)
 
     def _optimised(
         self,
@@ -334,7 +337,7 @@ class SlamPipeline:
         if isinstance(location, Location) and in_graph:
             location = replace(location, T_enu_world=graph.T_fixed_world)
         elif isinstance(location, Location):
-            location = location.fixes.locate(T_optimised)
+            location = location.fixes.locate(T_optimised, self.unit.by_gps)
         return graph, T_optimised, loops.without(graph.dropped), location
 
     def _mapped(self, estimate: Estimate, recorder: Recorder) -> Estimate:
@@ -350,7 +353,7 @@ class SlamPipeline:
         Raises:
             SlamError: lengths by LiDAR alone, or depth from elsewhere, are wrong.
         """
-        steps = usable_steps(lidar, are_needed=self.mode == "lidar")
+        steps = usable_steps(lidar, are_needed=self.unit.by_lidar)
         by_lidar = [agreement.of_steps(LIDAR_SOURCE, steps, drive.triangulated)]
         if (height := height_by_lidar(steps, drive)) is not None:
             by_lidar.append(
@@ -358,7 +361,7 @@ class SlamPipeline:
             )
         worst = max(filter(None, by_lidar), key=lambda each: each.sigmas, default=None)
         compared = (
-            [] if worst is None else [worst.required() if self.mode == "lidar" else worst.said()]
+            [] if worst is None else [worst.required() if self.unit.by_lidar else worst.said()]
         )
         source = self._config.depth.source
         if (

@@ -32,7 +32,6 @@ from slam.mapping.depth import KeyframeDepth
 from slam.pipeline.estimate import Estimate
 from slam.results.metrics import DepthOfKeyframes
 from slam.runtime.errors import Failed, SlamError
-from slam.sequences.catalogue import SimulatedSequence
 from slam.sequences.recording import RecordedSequence
 
 logger = logging.getLogger(__name__)
@@ -245,9 +244,9 @@ def true_depth(sequence: FrameSequence, index: int, count: int = 1) -> DepthMap 
 
     Of a simulated street only every fifth ``count`` is rendered.
     """
-    if isinstance(sequence, SimulatedSequence) and count % _EVERY_RENDERED != 1:
-        return None
     if isinstance(sequence, RecordedSequence) and index in sequence.true_depth_frames():
+        if sequence.is_rendered and count % _EVERY_RENDERED != 1:
+            return None
         return np.asarray(sequence.true_depth(index), np.float32)
     if sequence.T_camera_lidar is None or not sequence.has_scan(index):
         return None

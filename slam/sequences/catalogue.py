@@ -1,12 +1,10 @@
 """Opening of sequences: recognises the kind of a data set and chooses a sequence of it.
 
-Pieces of one recording are one sequence: chapters of a camera, files of a dash cam, split bags, numbered folders. The
-embedded sequence is a simulated world rendered in memory, with ground truth.
+Pieces of one recording are one sequence: chapters of a camera, files of a dash cam, split bags, numbered folders.
 """
 
 from __future__ import annotations
 
-import functools
 import logging
 import os
 import re
@@ -32,28 +30,17 @@ from slam.sequences import kitti, layouts, ros
 from slam.sequences.images import ReadImages
 from slam.sequences.loader import IMAGES, VIDEO, Asked, Loader, Opener
 from slam.sequences.poses import read_truth
-from slam.sequences.recording import (
-    ArrayReader,
-    RecordedSequence,
-    Source,
-    frame_range,
-    uniform_stamps,
-)
-from slam.simulation.kitti_layout import simulated_world
-from slam.simulation.options import SimulationOptions
+from slam.sequences.recording import ArrayReader, RecordedSequence, frame_range
 
 logger = logging.getLogger(__name__)
 
 KITTI_VARIABLE = "KITTI_ODOMETRY"
 KITTI_NAME = "KITTI"
-EMBEDDED_SEED = 640  # no weights saw it
-EMBEDDED_FRAMES = 320
 
 PLUG_INS = "erfsfm_slam.sequences"  # entry points of other packages: each names a `Loader`
 
 # the first that recognises a path opens it; loaders of other packages come before these
 LOADERS: tuple[Loader, ...] = (*kitti.LOADERS, *layouts.LOADERS, IMAGES, ros.LOADER, VIDEO)
-_CACHED_FRAMES = 32
 # by kind of recording: names of pieces, the drive they are of, and their number or the time at which they begin
 _PIECES = {
     "video": (
@@ -86,8 +73,7 @@ def open_sequence(
 
     Args:
         dataset: a data set of one of the ``LOADERS``, or a folder of several, or the word ``KITTI`` for
-            ``$KITTI_ODOMETRY``. Without it, a name is searched in ``$KITTI_ODOMETRY``; without either, the embedded
-            simulated sequence is opened.
+            ``$KITTI_ODOMETRY``. Without it, a name is searched in ``$KITTI_ODOMETRY``.
         name: which sequence of ``dataset``; optional where there is one only.
         camera: a ``camera.yaml``, or ``fov=DEGREES`` and more; it replaces the calibration of the data set.
         frames: ``A:B``, half-open, as Python reads a slice.
@@ -96,15 +82,7 @@ def open_sequence(
     Raises:
         SequenceError: one line on what was searched, where, what was found and what to do.
     """
-    if dataset is None and name is None:
-        for what, given in (("a camera file", camera), ("a file of true poses", truth)):
-            if given is not None:
-                raise SequenceError(f"{what} ({given}) without a data set: give --dataset as well")
-        options = SimulationOptions(route="loop", frames=EMBEDDED_FRAMES, seed=EMBEDDED_SEED)
-        sequence: RecordedSequence = SimulatedSequence(options)
-    else:
-        root = _root(dataset, name)
-        sequence = _choose(root, Asked(name, camera))
+    sequence = _choose(_root(dataset, name), Asked(name, camera))
     if truth is not None:
         sequence.take_truth(read_truth(truth, sequence.stamps))
     return sequence if frames is None else sequence.cut(*frame_range(frames, len(sequence)))
@@ -224,36 +202,6 @@ def _listed(folder: Path) -> str:
     names = sorted(path.name for path in folder.iterdir())
     shown = ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
     return shown or "an empty folder"
-
-
-class SimulatedSequence(RecordedSequence):
-    """A ``SimulatedWorld`` as a sequence; ``street`` has the depth, the scans and the true surface.
-
-    ``reference`` is re-based to the first camera; ``street.T_world_camera[0]`` takes it to the street.
-    """
-
-    def __init__(self, options: SimulationOptions, name: str = "sim") -> None:
-        street = self.street = simulated_world(options)
-        rendered = functools.lru_cache(maxsize=_CACHED_FRAMES)(
-            lambda index: street.render(index).image
-        )
-        super().__init__(
-            name,
-            ReadImages(
-                options.width,
-                options.height,
-                options.frames,
-                lambda index: np.array(rendered(index)),
-            ),
-            street.camera,
-            uniform_stamps(options.frames, options.rate),
-            (Source(f"simulated/{options.seed}", first=None),),
-            T_any_camera=np.asarray(street.T_world_camera, dtype=np.float64),
-            usual_height_m=street.camera_height_m,
-            T_camera_lidar=street.T_camera_lidar,
-            depth_maps={k: functools.partial(street.depth, k) for k in range(options.frames)},
-            distance_to_surface=street.distance_to_surface,
-        )
 
 
 class Piece(NamedTuple):

@@ -22,7 +22,7 @@ from erfsfm.common.readers.camera_file import CameraFile, Pinhole
 from erfsfm.common.readers.images import has_images, list_images, read_depth_map
 from erfsfm.common.readers.kitti import CalibrationFile, OdometryRoot
 from erfsfm.common.readers.numbering import NumberedFiles, by_number
-from slam.formats.ply import read_ply
+from slam.formats.ply import distances, read_ply, scene_of
 from slam.formats.trajectory import read_trajectory
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
@@ -39,7 +39,6 @@ from slam.sequences.recording import (
     require_stamps,
     uniform_stamps,
 )
-from slam.simulation.world import distances, scene_of
 
 logger = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import InitVar, dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,9 +74,10 @@ class RecordedSequence:
     that does not say its own. ``T_any_camera`` ``(N, 4, 4)`` are true poses in any world, NaN where unknown;
     ``reference`` follows from them where all are known. ``distance_to_surface`` gives the distance of points ``(M, 3)``
     of that world to the true surface, where the whole of it is known. Frame 0 is frame ``start`` of the ``recorded``
-    ones, by which images, scans and depth maps are numbered.
+    ones, by which images, scans and depth maps are numbered. Depth that ``is_rendered`` takes long.
     """
 
+    is_rendered: ClassVar[bool] = False
     name: str
     images: ImageSource
     camera: CameraFile | Intrinsics

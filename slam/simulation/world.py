@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.formats.ply import distances, scene_of
 from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.runtime.imports import import_open3d
@@ -64,20 +65,6 @@ class Surface:
             parameters = np.take(mesh.parameters, instance[part], axis=1)
             rgb[:, part] = SHADERS[Material(kind)](texels, colours, parameters)
         return rgb
-
-
-def scene_of(vertices: Float32Array, triangles: NDArray[np.uint32]) -> Any:
-    """Open3D's scene of triangles ``(T, 3)`` between vertices ``(V, 3)``."""
-    open3d = import_open3d()
-    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(open3d.core.Tensor(vertices), open3d.core.Tensor(triangles))
-    return scene
-
-
-def distances(scene: Any, points: FloatArray) -> FloatArray:
-    """Distance from points ``(M, 3)`` to the nearest surface of a scene, ``(M,)``."""
-    tensor = import_open3d().core.Tensor(points.astype(np.float32))
-    return np.asarray(scene.compute_distance(tensor).numpy(), dtype=np.float64)
 
 
 def place_rays(T_scene_sensor: FloatArray, directions: Float32Array) -> Float32Array:

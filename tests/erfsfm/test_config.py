@@ -17,8 +17,8 @@ from erfsfm.cli import main
 from erfsfm.common.errors import ConfigError
 from erfsfm.config import UNTRAINED, ExperimentConfig, dump_yaml, load_experiment
 from erfsfm.model_record import SHIPPED
-from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
+from slam.simulation.recording import write_kitti_root
 from slam.simulation.street import SimulatedStreet
 
 FRAMES = 12

@@ -15,8 +15,8 @@ from slam.commands.live import LiveRequest, run_live
 from slam.formats.trajectory import read_trajectory
 from slam.geometry.se3 import is_se3
 from slam.results.folder import RunFolder
-from slam.simulation.kitti_layout import simulated_world
 from slam.simulation.options import SimulationOptions
+from slam.simulation.recording import simulated_world
 
 SIZES = ((160, 120), (320, 240), (416, 128), (640, 480), (1280, 720), (1920, 1080))
 WAYS = ("walk", "look", "phone", "drone", "robot", "robot", "straight", "loop", "stands", "turns")

@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 
 from erfsfm.cli import app
 from erfsfm.inference import DepthPosePredictor
-from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
+from slam.simulation.recording import write_kitti_root
 from slam.simulation.street import SimulatedStreet
 
 SMALL = ("steps=2", "batch=2", "validate_every=2")

@@ -26,9 +26,8 @@ from slam.geometry.se3 import FloatArray
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import SlamPipeline
 from slam.runtime.errors import Failed
-from slam.sequences.catalogue import SimulatedSequence
-from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
+from slam.simulation.recording import SimulatedSequence, write_kitti_root
 
 FACTOR = 0.2  # unscaled lengths per metre
 NOISE = {

@@ -14,8 +14,8 @@ import yaml
 from erfsfm.common.errors import DataError
 from erfsfm.data.discovery import INDOOR_HEIGHT_M, discover, open_drive
 from erfsfm.data.recordings import Recording
-from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
+from slam.simulation.recording import write_kitti_root
 from slam.simulation.rooms import SimulatedRooms
 
 CAMERA = {"width": 48, "height": 32, "fx": 40.0, "fy": 41.0, "cx": 23.5, "cy": 15.5, "fps": 10}

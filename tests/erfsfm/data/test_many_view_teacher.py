@@ -11,8 +11,8 @@ from erfsfm.common.errors import TrainingError
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.recordings import Recording
-from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
+from slam.simulation.recording import write_kitti_root
 from slam.simulation.street import SimulatedStreet
 
 SIZE = (64, 208)

@@ -28,8 +28,8 @@ from erfsfm.data.window import HEIGHTS, snippet_motion
 from erfsfm.inference import DepthPosePredictor, learned_inverse_depth
 from erfsfm.model_record import find_weights, read_record
 from erfsfm.training.run import prepare, train
-from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
+from slam.simulation.recording import write_kitti_root
 from slam.simulation.street import SimulatedStreet
 
 FRAMES = 9

@@ -24,8 +24,8 @@ from erfsfm.evaluation.depth_protocols import (
 )
 from erfsfm.evaluation.streets import EVERY
 from erfsfm.training.run import prepare
-from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
+from slam.simulation.recording import write_kitti_root
 from slam.simulation.street import SimulatedStreet
 
 STEP = (0.05, 0.0, 0.1)

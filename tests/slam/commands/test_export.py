@@ -28,7 +28,8 @@ from slam.results.metrics import Metrics, ScaleMetrics
 from slam.runtime.errors import RunError
 from slam.runtime.files import PLACES
 from slam.runtime.imports import import_open3d
-from slam.sequences.catalogue import SimulatedSequence, open_sequence
+from slam.sequences.catalogue import open_sequence
+from slam.simulation.recording import SimulatedSequence
 from slam.simulation.street import SimulationOptions
 
 MakeRun = Callable[..., RunFolder]

@@ -23,8 +23,8 @@ from slam.loops.places import Places
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
 from slam.runtime.files import PLACES
-from slam.sequences.catalogue import SimulatedSequence
 from slam.simulation.options import SimulationOptions
+from slam.simulation.recording import SimulatedSequence
 
 UNIT = 0.5  # lengths of the map per metre
 FRAMES = 45

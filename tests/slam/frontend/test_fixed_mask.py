@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slam.frames import Grey, Mask, resized_mask
-from slam.frontend.fixed_mask import FixedMask
+from slam.frontend.fixed_mask import FixedMask, warn_of_fixed
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 
@@ -107,3 +107,14 @@ def test_another_size_begins_anew() -> None:
     assert fixed.mask is not None
     fixed.look_at(street()[0][:100, :310].copy())
     assert fixed.mask is None
+
+
+@pytest.mark.parametrize(("rows", "said"), [(0, 0), (10, 1), (70, 2)])
+def test_a_mask_that_leaves_little_of_the_world_is_said(
+    rows: int, said: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    fixed = np.zeros((100, 10), bool)
+    fixed[:rows] = True
+    warn_of_fixed(fixed)
+    assert len(caplog.records) == said
+    assert ("little of the world" in caplog.text) == (said == 2)

@@ -42,7 +42,7 @@ def scale(positions: FloatArray, seed: int) -> ScaleEstimate | Failed:
     )
     T_world_camera = np.tile(np.eye(4), (len(positions), 1, 1))
     T_world_camera[:, :3, 3] = positions
-    return GpsFixes(track, stamps, CONFIG, "gps").scale(T_world_camera)
+    return GpsFixes(track, stamps, CONFIG).scale(T_world_camera)
 
 
 def straight(length_m: float) -> FloatArray:
@@ -105,7 +105,7 @@ def test_speeds_give_the_lengths_of_a_walk_too_short_for_fixes_without_heights()
     track = GpsTrack(seconds, places, np.ones(len(seconds)), speeds)
     T_world_camera = np.tile(np.eye(4), (len(positions), 1, 1))
     T_world_camera[:, :3, 3] = positions
-    fixes = GpsFixes(track, stamps, CONFIG, "gps")
+    fixes = GpsFixes(track, stamps, CONFIG)
     found = fixes.scale(T_world_camera)
     assert isinstance(found, ScaleEstimate) and found.value == pytest.approx(4.0, rel=0.01)
     assert not fixes.has_heights and (fixes.sigmas[:, 2] > 10 * fixes.sigmas[:, 0]).all()

@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam.config.sections import ScaleConfig
 from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.measured import Measured
@@ -22,12 +21,11 @@ from slam.frontend.scale import (
     find_scale,
     gather_evidence,
     marginals,
-    resolve_mode,
-    scale_from_reference,
     scale_from_road,
     scale_track,
     solve_lengths,
 )
+from slam.frontend.scale_mode import height_by_lidar
 from slam.frontend.visual.motion import Motion
 from slam.geometry import se3
 from slam.geometry.se3 import from_rotation_vector
@@ -80,7 +78,12 @@ def measured(
 def find(
     mode, measurements: tuple[Drive, list[RelativePose]], height_m: float | None = HEIGHT_M
 ) -> Scale:
-    return find_scale(mode, height_m, *measurements)
+    """Modes that know metres after an odometry know no height here."""
+    drive, lidar_steps = measurements
+    if mode == "lidar":
+        height_m = height_by_lidar(lidar_steps, drive) or height_m
+        return find_scale(mode, height_m, drive, lidar_steps)
+    return find_scale(mode, height_m if mode == "camera-height" else None, drive)
 
 
 def lengths(scale: Scale) -> dict[Ends, float]:
@@ -250,31 +253,6 @@ def test_the_scale_track_follows_a_drifting_unit_across_frames_without_a_plane()
     assert track[0] == pytest.approx(2.0)
     assert track[60] == pytest.approx(2.0)
     assert track[-1] == pytest.approx(1 / 0.52)
-
-
-def test_reference_compares_the_first_path_lengths():
-    true = np.tile(np.eye(4), (100, 1, 1))
-    true[:, 2, 3] = np.arange(100)
-    unscaled = true.copy()
-    unscaled[:50, 2, 3] *= 0.25
-    estimate = scale_from_reference(unscaled, true)
-    assert estimate.value == pytest.approx(4.0)
-    assert estimate.frames_used == 50
-    assert isinstance(scale_from_reference(true * 0 + np.eye(4), true), Failed)
-
-
-@pytest.mark.parametrize(
-    ("configured", "height", "mode"),
-    [
-        ("auto", 1.65, "camera-height"),
-        ("auto", None, "none"),
-        ("none", 1.65, "none"),
-        ("reference", None, "reference"),
-        ("lidar", 1.65, "lidar"),
-    ],
-)
-def test_auto_stands_for_camera_height_where_it_is_known(configured, height, mode):
-    assert resolve_mode(ScaleConfig(mode=configured), height) == mode
 
 
 def evidence(**measured: np.ndarray) -> StepEvidence:

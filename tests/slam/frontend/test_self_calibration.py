@@ -11,8 +11,8 @@ import pytest
 from erfsfm.common.readers.camera_file import UNKNOWN_FX_SIGMA
 from slam.frames import Frame
 from slam.frontend.self_calibration import find_camera
-from slam.simulation.kitti_layout import simulated_world
 from slam.simulation.options import SimulationOptions
+from slam.simulation.recording import simulated_world
 
 WIDTH = 416
 STREET = SimulationOptions(route="loop", frames=250, seed=11, width=WIDTH, height=128)

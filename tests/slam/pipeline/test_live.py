@@ -16,8 +16,8 @@ from slam.frames import DepthMap, Frame, SnippetPoses
 from slam.geometry.se3 import apply, is_se3
 from slam.pipeline.run import SlamPipeline
 from slam.runtime.errors import SlamError
-from slam.sequences.catalogue import SimulatedSequence
 from slam.simulation.options import SimulationOptions
+from slam.simulation.recording import SimulatedSequence
 
 FACTOR = 0.2
 FRAMES = 250

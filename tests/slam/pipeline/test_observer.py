@@ -29,9 +29,9 @@ from slam.pipeline.observer import Observer
 from slam.pipeline.run import SlamPipeline, read_frame
 from slam.runtime.errors import Failed, MissingFrameError, SequenceError
 from slam.runtime.stopwatch import Stopwatch
-from slam.sequences.catalogue import SimulatedSequence
 from slam.simulation import street as street_world
 from slam.simulation.options import SimulationOptions
+from slam.simulation.recording import SimulatedSequence
 from slam.simulation.route import Route, plan_route
 
 FRAMES = 40

@@ -33,9 +33,9 @@ from slam.mapping.submap import Fusion
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline
 from slam.runtime.errors import ConfigError, Failed, SlamError
-from slam.sequences.catalogue import SimulatedSequence
 from slam.sequences.recording import RecordedSequence
 from slam.simulation.options import SimulationOptions
+from slam.simulation.recording import SimulatedSequence
 
 CAMERA = Intrinsics(width=104, height=32, fx=60.0, fy=60.0, cx=51.5, cy=12.0)
 HEIGHT_M = 1.5

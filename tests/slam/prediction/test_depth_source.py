@@ -36,8 +36,8 @@ from slam.prediction.depth_source import (
 from slam.results.folder import RunFolder
 from slam.runtime.errors import SlamError
 from slam.sequences.catalogue import open_sequence
-from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
+from slam.simulation.recording import write_kitti_root
 from slam.simulation.street import SimulatedStreet
 
 HEIGHT, WIDTH = 40, 96

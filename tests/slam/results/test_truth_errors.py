@@ -20,10 +20,10 @@ from slam.mapping.depth import KeyframeDepth
 from slam.results.metrics import MapMetrics
 from slam.results.truth_errors import DepthQuality, find_truth, map_errors, projected, true_depth
 from slam.runtime.errors import SequenceError
-from slam.sequences.catalogue import SimulatedSequence, open_sequence
+from slam.sequences.catalogue import open_sequence
 from slam.sequences.recording import RecordedSequence, Source
-from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
+from slam.simulation.recording import SimulatedSequence, write_kitti_root
 
 OPTIONS = SimulationOptions("straight", frames=14, seed=702, width=312, height=96)
 CAMERA = Intrinsics(8, 6, 5.0, 5.0, 3.5, 2.5)

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from slam.sequences.catalogue import SimulatedSequence
 from slam.sequences.poses import rebased
 from slam.sequences.recording import Source, frame_range
 from slam.simulation.options import SimulationOptions
+from slam.simulation.recording import SimulatedSequence
 
 
 @pytest.mark.parametrize(

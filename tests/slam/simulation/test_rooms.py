@@ -6,9 +6,9 @@ from scipy.ndimage import map_coordinates
 
 from slam.geometry import se3
 from slam.results.truth_errors import find_truth
-from slam.sequences.catalogue import SimulatedSequence, open_sequence
-from slam.simulation.kitti_layout import write_kitti_root
+from slam.sequences.catalogue import open_sequence
 from slam.simulation.options import SimulationOptions
+from slam.simulation.recording import SimulatedSequence, write_kitti_root
 from slam.simulation.rooms import SimulatedRooms
 
 SMALL = {"width": 96, "height": 72}

@@ -7,8 +7,8 @@ import pytest
 import yaml
 
 from slam.runtime.errors import SequenceError
-from slam.simulation.kitti_layout import write_kitti_root
 from slam.simulation.options import SimulationOptions
+from slam.simulation.recording import write_kitti_root
 from slam.simulation.street import SimulatedStreet
 
 

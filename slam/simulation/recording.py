@@ -1,10 +1,11 @@
-"""The worlds by their options, and their files as a KITTI odometry root."""
+"""Simulated worlds as recordings: rendered in memory, or written as a KITTI odometry root."""
 
 import json
 import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import lru_cache, partial
 from pathlib import Path
 
 import cv2
@@ -14,11 +15,17 @@ from numpy.typing import NDArray
 from slam.formats.ply import Ply, write_ply
 from slam.formats.trajectory import Trajectory, write_kitti
 from slam.runtime.errors import SequenceError
+from slam.sequences.catalogue import open_sequence
+from slam.sequences.images import ReadImages
+from slam.sequences.recording import RecordedSequence, Source, frame_range, uniform_stamps
 from slam.simulation.geometry import FloatArray
 from slam.simulation.options import VERSION, SimulationOptions
 from slam.simulation.rooms import SimulatedRooms
 from slam.simulation.street import SimulatedStreet
 from slam.simulation.world import SimulatedWorld
+
+EMBEDDED = SimulationOptions(route="loop", frames=320, seed=640)  # no weights saw it
+_CACHED_FRAMES = 32
 
 
 def simulated_world(options: SimulationOptions) -> SimulatedWorld:
@@ -28,6 +35,57 @@ def simulated_world(options: SimulationOptions) -> SimulatedWorld:
         SequenceError: if there are too few frames for the route.
     """
     return SimulatedRooms(options) if options.route == "rooms" else SimulatedStreet(options)
+
+
+class SimulatedSequence(RecordedSequence):
+    """A ``SimulatedWorld`` as a sequence; ``street`` has the depth, the scans and the true surface.
+
+    ``reference`` is re-based to the first camera; ``street.T_world_camera[0]`` takes it to the street.
+    """
+
+    is_rendered = True
+
+    def __init__(self, options: SimulationOptions, name: str = "sim") -> None:
+        street = self.street = simulated_world(options)
+        rendered = lru_cache(maxsize=_CACHED_FRAMES)(lambda index: street.render(index).image)
+        super().__init__(
+            name,
+            ReadImages(
+                options.width,
+                options.height,
+                options.frames,
+                lambda index: np.array(rendered(index)),
+            ),
+            street.camera,
+            uniform_stamps(options.frames, options.rate),
+            (Source(f"simulated/{options.seed}", first=None),),
+            T_any_camera=np.asarray(street.T_world_camera, dtype=np.float64),
+            usual_height_m=street.camera_height_m,
+            T_camera_lidar=street.T_camera_lidar,
+            depth_maps={k: partial(street.depth, k) for k in range(options.frames)},
+            distance_to_surface=street.distance_to_surface,
+        )
+
+
+def open_or_embedded(
+    dataset: Path | None = None,
+    name: str | None = None,
+    camera: Path | None = None,
+    frames: str | None = None,
+    truth: Path | None = None,
+) -> RecordedSequence:
+    """Open a sequence as `open_sequence`; the embedded world where neither a data set nor a name is given.
+
+    Raises:
+        SequenceError: one line on what was searched, where, what was found and what to do.
+    """
+    if dataset is not None or name is not None:
+        return open_sequence(dataset, name, camera, frames, truth)
+    for what, given in (("a camera file", camera), ("a file of true poses", truth)):
+        if given is not None:
+            raise SequenceError(f"{what} ({given}) without a data set: give --dataset as well")
+    world = SimulatedSequence(EMBEDDED)
+    return world if frames is None else world.cut(*frame_range(frames, len(world)))
 
 
 def write_kitti_root(

@@ -203,12 +203,6 @@ class MappingConfig(Section):
         gt=0,
         description="largest fused depth, metres; up to 1.4 times that where it is certain",
     )
-    hood_crop: float = Field(
-        default=0.0,
-        ge=0,
-        lt=1,
-        description="height of the lower part with the car's own hood that is left out, over the image's height",
-    )
     close_holes_m: float = Field(
         default=1.5,
         ge=0,

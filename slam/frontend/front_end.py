@@ -16,8 +16,6 @@ from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.frontend.keyframes.submaps import parts_of
 from slam.frontend.keyframes.units import learned_unit
 from slam.frontend.measured import LAST_STEPS, FrontEnd, Measured
-from slam.frontend.visual.motion import Motion
-from slam.frontend.visual.self_calibration import DepthError
 from slam.frontend.visual.step_tracker import Beside, Seen, StepTracker
 from slam.geometry.se3 import FloatArray, invert
 from slam.runtime.errors import Failed
@@ -63,6 +61,7 @@ class MotionTracker:
         self._config, self._intrinsics, self._camera_height_m = config, intrinsics, camera_height_m
         self._measured, self._stopwatch = measured, stopwatch
         self._steps = StepTracker(intrinsics, seed, measured, seen)
+        self.by_steps = self._steps.odometry  # knows the error of learned depth
         self._cores = ExitStack()
         # the networks, which predict little for keyframes, leave their core to optical flow
         self._cores.enter_context(opencv_threads(usable_cores()))
@@ -74,9 +73,9 @@ class MotionTracker:
         self.choose()
 
     @property
-    def depth_error(self) -> DepthError:
-        """That of learned depth, as the steps have it."""
-        return self._steps.odometry.depth_error
+    def _alone(self) -> KeyframeOdometry | None:
+        """The keyframes where they measure the drive: not before the choice, nor on a vehicle."""
+        return self._keyframes if self._chosen is FrontEnd.KEYFRAMES else None
 
     def add(self, recent: Sequence[Frame], current: Frame) -> list[Beside]:
         """Measure the motion to the next usable frame; what is to be measured beside it.
@@ -89,8 +88,7 @@ class MotionTracker:
             if self._keyframes is not None:
                 self._keyframes.follow(current)
         if not self._config.visual_odometry.enabled or self.keyframes_alone(current.index):
-            self._steps.forget()
-            return []
+            recent = ()
         with self._stopwatch.stage("geometry"):
             return self._steps.add(recent, current)
 
@@ -98,14 +96,6 @@ class MotionTracker:
         """Learned depth ``(H, W)`` of the frame that was added last."""
         if self._keyframes is not None:
             self._keyframes.learn(frame, depth)
-
-    def carried(self, depth_unscaled: DepthMap, step: Motion) -> DepthMap | None:
-        """Depth ``(h, w)`` at the end of a step from that ``(H, W)`` at its begin; None where nothing moved."""
-        return self._steps.odometry.carried(depth_unscaled, step)
-
-    def forget(self) -> None:
-        """After a gap the next frame is compared with none of those before."""
-        self._steps.forget()
 
     def choose(self) -> None:
         """Choose what measures the frames that follow, as soon as that is clear."""
@@ -120,19 +110,16 @@ class MotionTracker:
 
         A step measures it by a gap or a lost camera, and before the choice.
         """
-        if self._chosen is not FrontEnd.KEYFRAMES or self._keyframes is None:
+        if self._alone is None or self._measured.last_step(index) is not None:
             return False
         is_usable = {index - 1, index}.isdisjoint(list(self._measured.unusable)[-LAST_STEPS:])
-        by_step = self._measured.last_step(index)
-        return is_usable and by_step is None and self._keyframes.locates(index - 1, index)
+        return is_usable and self._alone.locates(index - 1, index)
 
     def pose(self, index: int) -> tuple[int, FloatArray] | None:
         """The located frame before one of the last, and ``T_before_frame`` unscaled; None where no map has it."""
-        if self._chosen is not FrontEnd.KEYFRAMES or self._keyframes is None:
+        if self._alone is None or not self._alone.segments:
             return None
-        if not self._keyframes.segments:
-            return None
-        segment = self._keyframes.segments[-1]
+        segment = self._alone.segments[-1]
         located: list[tuple[int, FloatArray]] = []
         for each in segment.frames[-_FRAMES:]:
             if each.index <= index and each.T_camera_world is not None:
@@ -152,15 +139,15 @@ class MotionTracker:
         Maps are cut into parts of one unit each; there are none of a vehicle, nor before the choice.
         """
         self.choose()
-        measured, odometry = self._measured.copy(), self._steps.odometry
-        measured.depth_error, measured.focal_length = odometry.depth_error, odometry.focal_length
+        measured, by_steps = self._measured.copy(), self.by_steps
+        measured.depth_error, measured.focal_length = by_steps.depth_error, by_steps.focal_length
         if self._keyframes is not None:
             measured.events = list(self._keyframes.events)
-        if self._chosen is FrontEnd.KEYFRAMES and self._keyframes is not None:
-            parts: list[LocalMap] = []
-            for segment in [each.copy() for each in self._keyframes.segments if each.started]:
-                parts += parts_of(segment, self._intrinsics)
-            measured.maps = parts
+        parts: list[LocalMap] = []
+        for segment in () if self._alone is None else self._alone.segments:
+            if segment.started:
+                parts += parts_of(segment.copy(), self._intrinsics)
+        measured.maps = parts
         return measured
 
     def close(self) -> None:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import reduce
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.frames import RelativePose, SnippetPoses
 from slam.geometry.robust import MAD_TO_SIGMA, running_median
@@ -22,7 +21,7 @@ NETWORK_SOURCE = "network"
 STUDENT_T_DOF = 12.0  # of the errors of measured steps: degrees of freedom of Student's t
 # steps that image geometry measured too, from which on unit and noise are measured
 LEAST_PAIRS = 20
-_NEAREST_PAIRS = 40  # in time, by which they are measured
+_USUAL_STEPS = 41  # whose median length is the usual one around a step
 _LONGEST_PAIR = 4  # frames: as far as a snippet reaches
 _SHORTEST_PAIR = 0.1  # over the median length of a step: shorter ones say nothing about the unit
 _CORRELATED_STEPS = 50  # over which errors are taken as equal
@@ -34,12 +33,13 @@ _LEAST_SIGMAS = np.repeat([np.deg2rad(0.03), 0.02], 3)
 
 @dataclass(frozen=True)
 class NetworkCalibration:
-    """Unit and noise of the pose network's steps from each of N frames, measured on the drive.
+    """Unit and noise of the pose network's steps, measured on the drive.
 
     Attributes:
-        unit: ``(N,)``, length per unscaled length of the step.
-        sigmas: ``(N, 6)`` of the step, rotation in radians, then translation over the usual length
-            of a step.
+        unit: ``(N,)``, length per unscaled length of the step from each frame: one of the drive, or
+            that of learned depth where it is not measured.
+        sigmas: ``(6,)`` of a step, rotation in radians, then translation over the usual length of a
+            step.
         pairs: steps that image geometry measured too; with fewer than 20 of them the unit is that
             of learned depth.
     """
@@ -59,12 +59,10 @@ class NetworkCalibration:
             return (
                 f"fewer than {LEAST_PAIRS} steps measure its unit, that of learned depth is taken"
             )
-        least, usual, most = np.quantile(self.unit / depth_unit, (0.0, 0.5, 1.0))
-        rotation = np.rad2deg(np.median(self.sigmas[:, :3]))
-        translation = np.median(self.sigmas[:, 5])
+        rotation = np.rad2deg(np.median(self.sigmas[:3]))
         return (
-            f"by {self.pairs} steps its unit is {usual:.2f} ({least:.2f} to {most:.2f}) of that of learned depth, and "
-            f"its noise {rotation:.2f} degrees and {100 * translation:.0f} % of a step"
+            f"by {self.pairs} steps its unit is {np.median(self.unit / depth_unit):.2f} of that of learned depth, and "
+            f"its noise {rotation:.2f} degrees and {100 * self.sigmas[5]:.0f} % of a step"
         )
 
     def scaled(self, steps: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
@@ -91,8 +89,8 @@ def calibrate_network(
 ) -> NetworkCalibration:
     """The unit and the noise of the network's steps, by the poses that image geometry measured too.
 
-    At a frame, they are medians over the pairs nearest in time. With fewer than 20 pairs, lengths
-    are in the unit of learned depth, and accordingly uncertain.
+    They are medians over all of these. With fewer than 20 of them, lengths are in the unit of
+    learned depth, and accordingly uncertain.
 
     Args:
         steps: ``T_k_next`` by k, unscaled.
@@ -105,8 +103,9 @@ def calibrate_network(
         if 0 < len(between) <= _LONGEST_PAIR and steps.keys() >= set(between):
             pairs.append(pose)
             by_network.append(reduce(np.matmul, (steps[k] for k in between)))
+    by_depth = NetworkCalibration(depth_unit, _USUAL_SIGMAS, 0)
     if len(pairs) < LEAST_PAIRS:
-        return _by_depth(depth_unit, len(pairs))
+        return by_depth
     first, last = np.array([pose.ends for pose in pairs]).T
     T_network = np.array(by_network)
     T_geometric = np.array([pose.T_from_to for pose in pairs])
@@ -117,17 +116,16 @@ def calibrate_network(
     ratio = (t_network * t_geometric).sum(axis=1) / np.maximum(length, 1e-12) ** 2
     used = (ratio > 0) & (length > _SHORTEST_PAIR * np.median(length / frames) * frames)
     if used.sum() < LEAST_PAIRS:
-        return _by_depth(depth_unit, int(used.sum()))
-    unit = 1.0 / _nearest_median(first[used], ratio[used], len(depth_unit))
-    t_network *= unit[first, None]
+        return by_depth
+    unit = 1.0 / float(np.median(ratio[used]))
+    t_network *= unit
     reach = np.where(np.arange(6) < 3, frames[:, None], length[:, None])
     error = np.abs(tangent(invert(T_network[used]) @ T_geometric[used])) / reach[used]
     # the unit follows image geometry, and so shares its errors
     shared = np.array([pose.sigmas for pose in pairs])[used] / reach[used]
-    own = _nearest_median(first[used], error, len(unit))
-    of_geometry = _nearest_median(first[used], shared, len(unit))
-    sigmas = np.hypot(MAD_TO_SIGMA * own, of_geometry)
-    return NetworkCalibration(unit, np.maximum(sigmas, _LEAST_SIGMAS), int(used.sum()))
+    sigmas = np.hypot(MAD_TO_SIGMA * np.median(error, axis=0), np.median(shared, axis=0))
+    sigmas = np.maximum(sigmas, _LEAST_SIGMAS)
+    return NetworkCalibration(np.full_like(depth_unit, unit), sigmas, int(used.sum()))
 
 
 def network_factors(
@@ -140,13 +138,13 @@ def network_factors(
     lengths = np.array([np.linalg.norm(T_k_next[:3, 3]) for T_k_next in scaled.values()])
     # sigmas by its own length would give a step that came out short more weight, and a drive that
     # is too short
-    usual = running_median(lengths, _NEAREST_PAIRS + 1)
+    usual = running_median(lengths, _USUAL_STEPS)
     reach = np.maximum(usual, _SHORTEST_PAIR * np.median(lengths)).clip(1e-9)
     # with nothing beside them, the usual sigmas are wide enough by themselves
     widening = np.sqrt(_CORRELATED_STEPS) if calibration.is_measured else 1.0
     factors = []
     for (k, T_k_next), length in zip(scaled.items(), reach, strict=True):
-        sigmas = calibration.sigmas[k] * np.repeat([1.0, length], 3)
+        sigmas = calibration.sigmas * np.repeat([1.0, length], 3)
         factors.append(
             RelativePose(
                 k, k + 1, T_k_next, sigmas, NETWORK_SOURCE, widening * sigmas, STUDENT_T_DOF
@@ -178,15 +176,3 @@ def _steps(snippet: SnippetPoses) -> dict[int, FloatArray]:
         k: invert(T_target[k]) @ T_target[k + 1]
         for k in range(min(snippet.sources), max(snippet.sources))
     }
-
-
-def _by_depth(depth_unit: FloatArray, pairs: int) -> NetworkCalibration:
-    return NetworkCalibration(depth_unit, np.tile(_USUAL_SIGMAS, (len(depth_unit), 1)), pairs)
-
-
-def _nearest_median(frames: NDArray[np.int64], values: FloatArray, count: int) -> FloatArray:
-    """The median value ``(count, ...)`` of the pairs nearest to each frame, of pairs ``(P, ...)`` by first frames."""
-    order, width = np.argsort(frames, kind="stable"), min(_NEAREST_PAIRS, len(frames))
-    windows = np.lib.stride_tricks.sliding_window_view(values[order], width, axis=0)
-    place = np.searchsorted(frames[order], np.arange(count)) - width // 2
-    return np.asarray(np.median(windows, axis=-1)[np.clip(place, 0, len(windows) - 1)])

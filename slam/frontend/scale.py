@@ -16,7 +16,7 @@ solved for the whole drive by robust least squares, whose matrix is banded
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 from typing import Literal, NamedTuple
@@ -83,6 +83,36 @@ class ScaleEstimate:
     frames_used: int
 
 
+@dataclass(frozen=True)
+class Unit:
+    """What a scale mode knows.
+
+    Attributes:
+        mode: resolved.
+        stated_m: the camera's height above the road, of modes by it; None where unknown.
+        metres: per unit of an odometry ``(N, 4, 4)``, of modes that measure them there; else None.
+    """
+
+    mode: ScaleMode
+    stated_m: float | None = None
+    metres: Callable[[FloatArray], ScaleEstimate | Failed] | None = None
+
+    @property
+    def by_lidar(self) -> bool:
+        """Whether steps by LiDAR give all lengths."""
+        return self.mode == "lidar"
+
+    @property
+    def by_gps(self) -> bool:
+        """Whether a GPS track gives all lengths."""
+        return self.mode == "gps"
+
+    @property
+    def gives_metres(self) -> bool:
+        """Whether lengths are to be metres."""
+        return self.mode != "none"
+
+
 class StepLength(NamedTuple):
     """A length, its relative sigma, and the sigma of independent errors that add up as its correlated ones do."""
 
@@ -134,32 +164,33 @@ class Scale:
         return measured.scaled(float(self.per_frame[min(measured.ends)]))
 
 
-def find_scale(
-    mode: ScaleMode, height_m: float | None, drive: Drive, lidar_steps: Sequence[RelativePose] = ()
-) -> Scale:
+def find_scale(unit: Unit, drive: Drive, lidar_steps: Sequence[RelativePose] = ()) -> Scale:
     """All lengths of a run in metres, or in camera heights where no height is known.
 
     Without a road in most frames, the planes that were found give no unit that means anything.
 
     Args:
-        mode: resolved.
-        height_m: of the camera above the road; None where the mode knows none.
+        unit: by the scale mode.
         drive: completed.
-        lidar_steps: steps by LiDAR, metres, where these give all lengths.
+        lidar_steps: steps by LiDAR, metres.
     """
-    motions = drive.triangulated
+    motions, height_m = drive.triangulated, unit.stated_m
     frames = len(drive)
-    unit = 1.0 if height_m is None else height_m
-    absolute = _absolute_lengths(drive.road_steps, unit, lidar_steps)
-    by_planes = scale_from_road(drive.measured.roads, unit)
-    prior_unit = _prior_unit(drive.measured.roads, motions, absolute, by_planes, unit)
+    if not unit.by_lidar:
+        lidar_steps = ()
+    elif (by_lidar := height_by_lidar(lidar_steps, drive)) is not None:
+        height_m = by_lidar
+    height = 1.0 if height_m is None else height_m
+    absolute = _absolute_lengths(drive.road_steps, height, lidar_steps)
+    by_planes = scale_from_road(drive.measured.roads, height)
+    prior_unit = _prior_unit(drive.measured.roads, motions, absolute, by_planes, height)
     steps = links(motions, frames)
     evidence = gather_evidence(steps, drive.steps, absolute, prior_unit)
     if not isinstance(by_planes, Failed):
         # a car ahead taken for the road for seconds would outweigh all other measurements
         most = np.log(_MAX_CONTRADICTION) * min(evidence.learned_noise(), _MOST_NOISE_BESIDE_ROAD)
         evidence.absolute[np.abs(evidence.absolute - evidence.learned) > most] = np.nan
-    solved = solve_lengths(evidence, unit)
+    solved = solve_lengths(evidence, height)
     row_at = np.searchsorted([first for first, _ in steps], np.arange(frames), side="right") - 1
     per_frame = prior_unit * solved.unit_correction[row_at]
     misfit = np.abs(evidence.absolute - np.log(solved.length))
@@ -181,7 +212,7 @@ def find_scale(
     rows = zip(steps, np.transpose(values).tolist(), strict=True)
     lengths = {ends: StepLength(*row) for ends, row in rows if np.isfinite(row[0])}
     contradicted = list(compress(steps, solved.contradicted))
-    return Scale(mode, estimate, per_frame, lengths, named, contradicted)
+    return Scale(unit.mode, estimate, per_frame, lengths, named, contradicted)
 
 
 def _absolute_lengths(
@@ -215,6 +246,21 @@ def _prior_unit(
         # learned ground plane
         return np.full(len(roads), by_planes.value)
     return scale_track(roads, camera_height, by_planes)
+
+
+def height_by_lidar(lidar_steps: Sequence[RelativePose], drive: Drive) -> float | None:
+    """The camera's height from steps measured by LiDAR and the road, or else by learned planes; None without both."""
+    metres = {pose.ends: float(np.linalg.norm(pose.T_from_to[:3, 3])) for pose in lidar_steps}
+    roads = drive.road_steps
+    heights = [metres[ends] / roads[ends].length_heights for ends in roads if ends in metres]
+    if not heights:
+        for ends, motion in drive.triangulated.items():
+            if ends not in metres:
+                continue
+            plane = drive.measured.roads[ends[0]]
+            if not isinstance(plane, Failed):
+                heights.append(metres[ends] / motion.length_unscaled * plane)
+    return float(np.median(heights)) if heights else None
 
 
 def scale_from_road(roads: Sequence[float | Failed], height: float = 1.0) -> ScaleEstimate | Failed:

@@ -6,60 +6,20 @@ solved, or metres per unit of an odometry after that.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 import slam.frames
 from slam.config.sections import ScaleConfig, ScaleMode
-from slam.frames import Ends, RelativePose
-from slam.frontend.drive import Drive
+from slam.frames import Ends
 from slam.frontend.gps import GpsFixes
 from slam.frontend.lidar_odometry import has_scans
-from slam.frontend.scale import ScaleEstimate
+from slam.frontend.scale import ScaleEstimate, Unit
 from slam.geometry.se3 import FloatArray, path_distance
 from slam.runtime.errors import Failed, SlamError
 
 _REFERENCE_FRAMES = 50  # number of first frames that mode reference compares
-
-HeightOf = Callable[[Drive, Sequence[RelativePose]], float | None]
-
-
-def _unknown_height(drive: Drive, lidar_steps: Sequence[RelativePose]) -> None:
-    """Of modes that know metres by an odometry, or not at all."""
-
-
-@dataclass(frozen=True)
-class Unit:
-    """What a scale mode knows.
-
-    Attributes:
-        mode: resolved.
-        height_m: the camera's height above the road, of a completed drive and its steps by LiDAR; None
-            where lengths stay in camera heights at first.
-        metres: per unit of an odometry ``(N, 4, 4)``; None of modes that need none.
-    """
-
-    mode: ScaleMode
-    height_m: HeightOf = _unknown_height
-    metres: Callable[[FloatArray], ScaleEstimate | Failed] | None = None
-
-    @property
-    def by_lidar(self) -> bool:
-        """Whether steps by LiDAR give all lengths."""
-        return self.mode == "lidar"
-
-    @property
-    def by_gps(self) -> bool:
-        """Whether a GPS track gives all lengths."""
-        return self.mode == "gps"
-
-    @property
-    def gives_metres(self) -> bool:
-        """Whether lengths are to be metres."""
-        return self.mode != "none"
 
 
 def unit_of(
@@ -86,10 +46,10 @@ def unit_of(
                 f"{needs} a known height; {sequence.name} has none: give a camera.yaml "
                 "with camera_height_m (fov=DEGREES has none) or choose scale.mode=none"
             )
-        return Unit(mode, lambda drive, lidar_steps: height_m)
+        return Unit(mode, height_m)
     if mode == "lidar":
         require_scans("scale.mode=lidar", sequence)
-        return Unit(mode, lambda drive, steps: height_by_lidar(steps, drive) or height_m)
+        return Unit(mode, height_m)
     if mode == "reference":
         if true_poses is None:
             raise SlamError(
@@ -121,21 +81,6 @@ def require_scans(setting: str, sequence: slam.frames.Sequence) -> None:
             f"{setting} needs LiDAR scans of neighbouring frames and their calibration; {sequence.name} has none: "
             "leave the setting out or give a sequence with scans"
         )
-
-
-def height_by_lidar(lidar_steps: Sequence[RelativePose], drive: Drive) -> float | None:
-    """The camera's height from steps measured by LiDAR and the road, or else by learned planes; None without both."""
-    metres = {pose.ends: float(np.linalg.norm(pose.T_from_to[:3, 3])) for pose in lidar_steps}
-    roads = drive.road_steps
-    heights = [metres[ends] / roads[ends].length_heights for ends in roads if ends in metres]
-    if not heights:
-        for ends, motion in drive.triangulated.items():
-            if ends not in metres:
-                continue
-            plane = drive.measured.roads[ends[0]]
-            if not isinstance(plane, Failed):
-                heights.append(metres[ends] / motion.length_unscaled * plane)
-    return float(np.median(heights)) if heights else None
 
 
 def scale_from_reference(

@@ -35,7 +35,7 @@ MOST_RELATIVE_SIGMA = 0.3  # of fused depth, over it: beyond that a network gues
 _EXACT = 0.01  # relative sigma below which depth is not a network's: border, sky and edges are not in doubt
 _BEHIND = 1.2  # depth that an earlier view sees over that of a thing which was not there yet
 _PIECE = np.ones((5, 5), np.uint8)  # pixels of the least such thing: at edges, depth is blurred
-FILTERS = ("unknown", "border", "bonnet", "sky", "range", "sigma", "edge", "agreement", "moving")
+FILTERS = ("unknown", "border", "sky", "range", "sigma", "edge", "agreement", "moving")
 _REMEMBERED = 24
 
 
@@ -65,11 +65,10 @@ class DepthFilters:
             intrinsics.rays(intrinsics.pixel_grid()).reshape(-1, 3).T, dtype=np.float32
         )
         height, width = intrinsics.height, intrinsics.width
-        border, self._above_hood = round(_BORDER * width), np.ones((height, width), dtype=bool)
+        border = round(_BORDER * width)
         self._top_rows = border + 1
         self._inside = np.zeros((height, width), dtype=bool)
         self._inside[border:, border : width - border] = True
-        self._above_hood[height - round(config.hood_crop * height) :] = False
         self._taken = np.zeros(len(FILTERS))
         self._frames = 0
 
@@ -99,7 +98,6 @@ class DepthFilters:
         masks = (
             depth > 0,
             self._inside | is_exact,
-            self._above_hood,
             ~self._is_sky(view.image) | is_exact,
             (depth >= config.depth_min_m) & (depth < farthest),
             everything if view.relative_sigma is None else sigma <= MOST_RELATIVE_SIGMA,

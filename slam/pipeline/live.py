@@ -20,8 +20,7 @@ from slam.frames import Frame, Image, Intrinsics, Predictor
 from slam.frontend.drive import Drive, complete_drive
 from slam.frontend.factors import chain_odometry, make_factors
 from slam.frontend.measured import LAST_STEPS, Measured, frame_support
-from slam.frontend.scale import Scale, find_scale
-from slam.frontend.scale_mode import Unit
+from slam.frontend.scale import Scale, Unit, find_scale
 from slam.geometry.se3 import FloatArray, apply, compose, invert
 from slam.loops.closure import LoopClosures
 from slam.loops.places import PlaceStructure
@@ -148,7 +147,7 @@ class LivePoses:
         # keyframes know all lengths but their unit, which learned depth of the ground gives
         roads_alone = Drive(Measured(roads=measured.roads))
         window = roads_alone if by_keyframes else complete_drive(measured, self._sources)
-        scale = find_scale(self._metric.mode, self._metric.height_m(window, ()), window)
+        scale = find_scale(self._metric, window)
         self.unit_name = scale.unit_name
         unit = float(np.median(scale.per_frame) if by_keyframes else scale.per_frame[-1])
         if self._unit is None:

@@ -37,6 +37,10 @@ _MOST_UNREAD = 30  # unreadable images in a row: three seconds at 10 Hz, beyond 
 _LOOP_STRIDE = 4
 
 
+# the stage that waits for work of another thread, its result, and what keeps it where there is one
+Task = tuple[str, Future[Any], Callable[[Any], None]]
+
+
 @dataclass
 class FrameInWork:
     """A frame, what the networks were asked of it (None: nothing).
@@ -49,15 +53,6 @@ class FrameInWork:
     snippet: Future[SnippetPoses] | None
     depth: DepthMap | None = None
     height: float | None = None
-
-
-@dataclass(frozen=True)
-class Task:
-    """Work of another thread, the stage that waits for it, and what to do with its ``result`` where there is one."""
-
-    stage: str
-    result: Future[Any]
-    keep: Callable[[Any], None]
 
 
 class Observer:
@@ -276,7 +271,6 @@ class Observer:
         except Exception as error:
             self._tasks.clear()
             self._recent = ()
-            self.tracker.forget()
             reason = f"it could not be measured: {explained(error)}"
             self.measured.unusable[index] = reason
             if len(self.measured) == index:  # one entry in ``roads`` as all frames
@@ -299,18 +293,18 @@ class Observer:
         self.measured.roads.append(Failed("its depth was not predicted"))
         self._recent = (*self._recent, current)[-ROTATION_BASELINE:]
         if current.snippet is not None:
-            self._tasks.append(Task("pose network", current.snippet, self._keep_snippet))
+            self._tasks.append(("pose network", current.snippet, self._keep_snippet))
         for stage, work, keep in beside:
-            self._tasks.append(Task(stage, self._beside.submit(work), keep))
+            self._tasks.append((stage, self._beside.submit(work), keep))
         if current.prediction is not None:
             learn = partial(self._learn, current)
-            self._tasks.append(Task("depth network", current.prediction, learn))
+            self._tasks.append(("depth network", current.prediction, learn))
         if was_asked:  # that of a keyframe comes while it is adjusted
             self._finish_tasks("depth network")
 
     def _learn(self, current: FrameInWork, depth: DepthMap) -> None:
         """Everything that the depth ``(H, W)`` of a frame gives."""
-        frame, error = current.frame, self.tracker.depth_error
+        frame, error = current.frame, self.tracker.by_steps.depth_error
         if frame.fixed is not None:
             depth = np.where(resized_mask(frame.fixed, *depth.shape[::-1]), np.float32(0), depth)
         with self._stopwatch.stage("road"):
@@ -332,7 +326,7 @@ class Observer:
             recent.depth = self._carried(recent)
         if recent.depth is None:
             recent.depth = self._predict(frame).result()
-            road = self._plane.fit(recent.depth, self.tracker.depth_error)
+            road = self._plane.fit(recent.depth, self.tracker.by_steps.depth_error)
             recent.height = None if isinstance(road, Failed) else road
         return frame, recent.depth, recent.height
 
@@ -344,7 +338,7 @@ class Observer:
         before = next((each for each in self._recent if each.frame.index == step.ends[0]), None)
         if before is None or before.depth is None:
             return None
-        depth, recent.height = self.tracker.carried(before.depth, step), before.height
+        depth, recent.height = self.tracker.by_steps.carried(before.depth, step), before.height
         if depth is not None:
             self._keep_for_map(recent.frame, depth)
         return depth
@@ -359,15 +353,17 @@ class Observer:
         """Keep a thinned frame for the map."""
         if self._config.mapping.enabled:
             keyframe = self._beside.submit(Keyframe.of, frame, depth, self._spill_file)
-            self._tasks.append(Task("map", keyframe, self.measured.keyframes.append))
+            self._tasks.append(("map", keyframe, self.measured.keyframes.append))
 
     def _finish_tasks(self, stage: str | None = None) -> None:
         """Wait for the tasks of the last frame, or for those of one stage alone."""
-        tasks = [task for task in self._tasks if stage in (None, task.stage)]
-        # so that a failed one is not raised again
-        self._tasks = [task for task in self._tasks if task not in tasks]
+        tasks, self._tasks = self._tasks, []  # so that a failed one is not raised again
         for task in tasks:
-            with self._stopwatch.stage(task.stage):
-                result = task.result.result()
-            if result is not None:
-                task.keep(result)
+            of_stage, result, keep = task
+            if stage not in (None, of_stage):
+                self._tasks.append(task)
+                continue
+            with self._stopwatch.stage(of_stage):
+                found = result.result()
+            if found is not None:
+                keep(found)

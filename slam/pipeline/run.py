@@ -30,8 +30,8 @@ from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.lidar_odometry import LIDAR_SOURCE, LidarPath, lidar_path, usable_steps
 from slam.frontend.measured import Measured
 from slam.frontend.network_motion import chain_raw
-from slam.frontend.scale import Scale, ScaleEstimate, find_scale
-from slam.frontend.scale_mode import height_by_lidar, require_scans, unit_of
+from slam.frontend.scale import Scale, ScaleEstimate, find_scale, height_by_lidar
+from slam.frontend.scale_mode import require_scans, unit_of
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures, close_loops
@@ -152,9 +152,7 @@ class SlamPipeline:
             lidar = lidar_path(self.sequence, self._progress)
         lidar_steps, agreements = self._compared(drive, lidar)
         with self._watch.stage("scale"):
-            height_m = self.unit.height_m(drive, lidar_steps)
-            by_lidar = lidar_steps if self.unit.by_lidar else ()
-            scale = find_scale(self.unit.mode, height_m, drive, by_lidar)
+            scale = find_scale(self.unit, drive, lidar_steps)
         factors = make_factors(drive, scale)
         if self.unit.metres is not None:
             metres = self.unit.metres(chain_odometry(factors, len(drive)))
@@ -288,9 +286,9 @@ class SlamPipeline:
         """
         if isinstance(metres, Failed) or isinstance(scale.estimate, Failed):
             return []
-        name, stated_m = f"scale.mode={self.unit.mode}", self.sequence.camera_height_m
-        height = agreement.of_height(name, metres.value, stated_m, scale.estimate.spread)
-        return [height.required()]
+        source, stated_m = f"scale.mode={self.unit.mode}", self.sequence.camera_height_m
+        by_unit = agreement.of_height(source, metres.value, stated_m, scale.estimate.spread)
+        return [by_unit.required()]
 
     def _loops(
         self,

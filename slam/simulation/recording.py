@@ -81,9 +81,8 @@ def open_or_embedded(
     """
     if dataset is not None or name is not None:
         return open_sequence(dataset, name, camera, frames, truth)
-    for what, given in (("a camera file", camera), ("a file of true poses", truth)):
-        if given is not None:
-            raise SequenceError(f"{what} ({given}) without a data set: give --dataset as well")
+    if camera is not None or truth is not None:
+        raise SequenceError("a camera or true poses without a data set: give --dataset as well")
     world = SimulatedSequence(EMBEDDED)
     return world if frames is None else world.cut(*frame_range(frames, len(world)))
 

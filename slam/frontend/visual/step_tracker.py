@@ -53,12 +53,11 @@ class StepTracker:
         self._measured, self._seen = measured, seen
         self._apart: Apart | None = None
 
-    def forget(self) -> None:
-        """Compare the next frame with none of those before."""
-        self._apart = None
-
     def add(self, recent: Sequence[Frame], current: Frame) -> list[Beside]:
-        """Measure the step to a frame from the last ``recent`` one, and say what may be measured beside it."""
+        """Measure the step to a frame from the last ``recent`` one, and say what may be measured beside it.
+
+        Without a recent frame, the next one is compared with none of those before.
+        """
         apart, self._apart = self._apart, None
         if not recent:
             return []

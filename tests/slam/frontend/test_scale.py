@@ -18,6 +18,7 @@ from slam.frontend.scale import (
     Scale,
     ScaleEstimate,
     StepEvidence,
+    Unit,
     find_scale,
     gather_evidence,
     marginals,
@@ -25,7 +26,6 @@ from slam.frontend.scale import (
     scale_track,
     solve_lengths,
 )
-from slam.frontend.scale_mode import height_by_lidar
 from slam.frontend.visual.motion import Motion
 from slam.geometry import se3
 from slam.geometry.se3 import from_rotation_vector
@@ -79,11 +79,8 @@ def find(
     mode, measurements: tuple[Drive, list[RelativePose]], height_m: float | None = HEIGHT_M
 ) -> Scale:
     """Modes that know metres after an odometry know no height here."""
-    drive, lidar_steps = measurements
-    if mode == "lidar":
-        height_m = height_by_lidar(lidar_steps, drive) or height_m
-        return find_scale(mode, height_m, drive, lidar_steps)
-    return find_scale(mode, height_m if mode == "camera-height" else None, drive)
+    is_stated = mode in ("camera-height", "lidar")
+    return find_scale(Unit(mode, height_m if is_stated else None), *measurements)
 
 
 def lengths(scale: Scale) -> dict[Ends, float]:

@@ -140,7 +140,7 @@ def run_on(damage: Damage) -> tuple[Estimate, str]:
             lines.append(record.getMessage())
 
     listing = Listing(logging.WARNING)
-    logger = logging.getLogger("slam.pipeline")
+    logger = logging.getLogger("slam")
     logger.addHandler(listing)
     try:
         return run(damage, BAD, f"mapping.enabled={str(damage is black).lower()}"), "\n".join(lines)

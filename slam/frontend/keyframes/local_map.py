@@ -38,6 +38,8 @@ _NEAR_COSINE = 0.7
 _ALIGNED_PX = 2.0
 _PROJECTED_PX = 4.0
 _ALIGNED_KEYFRAMES = 4
+# of dense flow there and back, and by which that of corners may correct it
+_RETURNED_PX, _REFINED_PX = 2.0, 3.0
 # a point that two keyframes do not find is hidden; after three keyframes that find hardly any, so
 # are those that remain
 _ATTEMPTS, _MISSES = 2, 3
@@ -403,13 +405,42 @@ class NewImage:
         """Some corners of a keyframe from guesses ``(M, 2)``, and which were found ``(M,)``."""
         if keyframe.grey is None:
             return guesses, np.zeros(len(rows), np.bool_)
+        turned, pixels = self._as_turned(keyframe, keyframe.grey)
+        matched, kept = track(turned, self._grey, pixels[rows], _MATCHED, guesses)
+        return matched, kept & are_inside(matched, self._grey.shape)
+
+    def flowed(self, keyframe: TrackedKeyframe) -> tuple[TrackIds, Pixels]:
+        """Corners of the last keyframe by dense optical flow, where steps are too large for that of corners."""
+        assert keyframe.grey is not None
+        turned, pixels = self._as_turned(keyframe, keyframe.grey)
+        flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        there = flow.calc(turned, self._grey, np.zeros((0, 0), np.float32))
+        back = flow.calc(self._grey, turned, np.zeros((0, 0), np.float32))
+        rows = np.flatnonzero(are_inside(pixels, self._grey.shape))
+        flowed = pixels[rows] + _at(there, pixels[rows])
+        kept = are_inside(flowed, self._grey.shape)
+        rows, flowed = rows[kept], flowed[kept]
+        returned = np.linalg.norm(flowed + _at(back, flowed) - pixels[rows], axis=1)
+        rows, flowed = rows[returned < _RETURNED_PX], flowed[returned < _RETURNED_PX]
+        matched, kept = self.matched(keyframe, rows, flowed)
+        kept &= np.linalg.norm(matched - flowed, axis=1) < _REFINED_PX
+        flowed[kept] = matched[kept]
+        return keyframe.track_ids[rows], flowed
+
+    def _as_turned(self, keyframe: TrackedKeyframe, grey: Grey) -> tuple[Grey, Pixels]:
+        """A keyframe's image as the new camera is turned, and its corners ``(M, 2)`` there."""
         K = self.intrinsics.K
         H = K @ (self.T_camera_world[:3, :3] @ keyframe.T_camera_world[:3, :3].T) @ np.linalg.inv(K)
         if keyframe.index not in self._turned:
             size = self.intrinsics.width, self.intrinsics.height
-            turned = cv2.warpPerspective(keyframe.grey, H, size, borderMode=cv2.BORDER_REPLICATE)
+            turned = cv2.warpPerspective(grey, H, size, borderMode=cv2.BORDER_REPLICATE)
             self._turned[keyframe.index] = np.asarray(turned, np.uint8)
-        moved = np.column_stack([keyframe.places[rows], np.ones(len(rows))]) @ H.T
+        moved = np.column_stack([keyframe.places, np.ones(len(keyframe.places))]) @ H.T
         pixels = (moved[:, :2] / moved[:, 2:]).astype(np.float32)
-        matched, kept = track(self._turned[keyframe.index], self._grey, pixels, _MATCHED, guesses)
-        return matched, kept & are_inside(matched, self._grey.shape)
+        return self._turned[keyframe.index], pixels
+
+
+def _at(flow: NDArray[np.float32], pixels: Pixels) -> Pixels:
+    """Flow ``(H, W, 2)`` at the nearest pixels ``(M, 2)``, inside."""
+    x, y = np.rint(pixels).astype(np.intp).T
+    return flow[y, x]

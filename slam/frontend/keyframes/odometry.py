@@ -172,9 +172,8 @@ class KeyframeOdometry:
         turn = image_turn(*images) if turn is None else turn
         T_last_step = make(turn.R_now_before, np.zeros(3))
         image = NewImage(frame.grey, T_last_step @ self._T_camera_world, self._intrinsics)
-        for found in (image.flowed(segment.keyframes[-1]), (track_ids, pixels)):
-            if self._locate(segment, frame, *found, is_doubtful=True):
-                return
+        if self._locate(segment, frame, *image.flowed(segment.keyframes[-1]), is_doubtful=True):
+            return
         self._T_last_step = T_last_step
         if turn.correlation > _SURE_CORRELATION and not self._lost:
             self._T_camera_world = compose(self._T_last_step, self._T_camera_world)
@@ -299,13 +298,12 @@ class KeyframeOdometry:
     ) -> None:
         """The best motion since the last keyframe, and its points, where it is doubtful or these had no parallax."""
         before = segment.keyframes[-1]
-        rows = np.searchsorted(before.track_ids, track_ids)
         known = segment.known(track_ids)
         settled = segment.parallax(segment.keyframes[-_LOOKED_BACK:]).settled[track_ids]
         if settled.sum() >= MIN_POINTS and not is_doubtful:
             return
         tracks = track_ids[known]
-        pixels_before = before.pixels[rows[known]]
+        pixels_before = before.pixels[np.searchsorted(before.track_ids, tracks)]
         now = pixels[known].astype(np.float64)
         depth = apply(before.T_camera_world, segment.points[tracks])[:, 2]
         T = self._T_camera_world @ invert(before.T_camera_world)

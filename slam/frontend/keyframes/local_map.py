@@ -400,8 +400,9 @@ class NewImage:
         flowed = pixels[rows] + _at(there, pixels[rows])
         kept = are_inside(flowed, self._grey.shape)
         rows, flowed = rows[kept], flowed[kept]
-        returned = np.linalg.norm(flowed + _at(back, flowed) - pixels[rows], axis=1)
-        rows, flowed = rows[returned < _RETURNED_PX], flowed[returned < _RETURNED_PX]
+        returned = flowed + _at(back, flowed)
+        kept = np.linalg.norm(returned - pixels[rows], axis=1) < _RETURNED_PX
+        rows, flowed = rows[kept], flowed[kept]
         matched, kept = self.matched(keyframe, rows, flowed)
         kept &= np.linalg.norm(matched - flowed, axis=1) < _REFINED_PX
         flowed[kept] = matched[kept]
@@ -424,4 +425,4 @@ class NewImage:
 def _at(flow: NDArray[np.float32], pixels: Pixels) -> Pixels:
     """Flow ``(H, W, 2)`` at the nearest pixels ``(M, 2)``, inside."""
     x, y = np.rint(pixels).astype(np.intp).T
-    return flow[y, x]
+    return np.asarray(flow[y, x])

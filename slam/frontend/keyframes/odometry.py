@@ -170,13 +170,13 @@ class KeyframeOdometry:
         if self._locate(segment, frame, track_ids, pixels):
             return
         turn = image_turn(*images) if turn is None else turn
-        T_last_step = make(turn.R_now_before, np.zeros(3))
-        image = NewImage(frame.grey, T_last_step @ self._T_camera_world, self._intrinsics)
+        self._T_last_step = make(turn.R_now_before, np.zeros(3))
+        T_turned = compose(self._T_last_step, self._T_camera_world)
+        image = NewImage(frame.grey, T_turned, self._intrinsics)
         if self._locate(segment, frame, *image.flowed(segment.keyframes[-1]), is_doubtful=True):
             return
-        self._T_last_step = T_last_step
         if turn.correlation > _SURE_CORRELATION and not self._lost:
-            self._T_camera_world = compose(self._T_last_step, self._T_camera_world)
+            self._T_camera_world = T_turned
             self._add_keyframe(segment, frame, *_NOTHING)
             segment.frames.append(TrackedFrame(frame.index, *_NOTHING, self._T_camera_world))
             return
@@ -246,9 +246,8 @@ class KeyframeOdometry:
         known = segment.known(track_ids)
         places, pixels = pixels, in_middle_row(pixels, self._turn_rate, self._intrinsics)
         pose = self._resected(segment, track_ids[known], pixels[known])
-        if pose is None:
-            return False
-        if not is_doubtful and len(pose.inliers) < _DOUBTFUL_RATIO * known.sum():
+        least = 0.0 if is_doubtful else _DOUBTFUL_RATIO * known.sum()
+        if pose is None or len(pose.inliers) < least:
             return False
         self._lost = 0
         before, self._T_camera_world = self._T_camera_world, pose.T_camera_world
@@ -278,9 +277,7 @@ class KeyframeOdometry:
         if self._spread is None:
             self._spread = segment.spread(self._intrinsics)
         spread = self._spread[np.searchsorted(segment.keyframes[-1].track_ids, track_ids)]
-        before = np.zeros(0, np.bool_)
-        if segment.frames:
-            before = np.isin(track_ids, segment.frames[-1].track_ids)
+        before = np.isin(track_ids, [last.track_ids for last in segment.frames[-1:]])
         trusted = before if before.sum() >= MIN_POINTS else None
         pose = resect(
             guesses,

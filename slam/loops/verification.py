@@ -236,13 +236,7 @@ def matches(
     first: View, second: View, thresholds: LoopThresholds
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows of mutual nearest neighbours by Hamming distance that pass Lowe's ratio test."""
-    return mutual(hamming(first.descriptors, second.descriptors), thresholds)
-
-
-def mutual(
-    distance: NDArray[np.float32], thresholds: LoopThresholds
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """The same by distances ``(M, N)``, infinite where two may not match."""
+    distance = hamming(first.descriptors, second.descriptors)
     if min(distance.shape) < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
     rows, nearest = np.arange(len(distance)), distance.argmin(axis=1)

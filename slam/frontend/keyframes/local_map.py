@@ -8,9 +8,8 @@ know a depth as well.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -38,6 +37,8 @@ _NEAR_COSINE = 0.7
 _ALIGNED_PX = 2.0
 _PROJECTED_PX = 4.0
 _ALIGNED_KEYFRAMES = 4
+# of dense flow there and back, and by which that of corners may correct it
+_RETURNED_PX, _REFINED_PX = 2.0, 3.0
 # a point that two keyframes do not find is hidden; after three keyframes that find hardly any, so
 # are those that remain
 _ATTEMPTS, _MISSES = 2, 3
@@ -55,9 +56,9 @@ _LEAST_RATIOS = 20  # of known points to learned depth, by which new ones get th
 
 
 class Parallax:
-    """Of ``N`` points: the first ``centre`` that saw each ``(N, 3)``, NaN for none, and ``angle`` ``(N,)``.
+    """Of ``N`` points: the first ``centre`` that saw each ``(N, 3)``, NaN for none, and how well rays know them.
 
-    The angle is the widest between that first ray of a point and others, radians.
+    Rays know a point by the widest angle between the first one and others.
     """
 
     def __init__(self, points: FloatArray) -> None:
@@ -77,18 +78,14 @@ class Parallax:
         self._cosine[rows] = np.minimum(self._cosine[rows], cosine)
 
     @property
-    def angle(self) -> FloatArray:
-        """Radians ``(N,)``."""
-        return np.asarray(np.arccos(np.clip(self._cosine, -1.0, 1.0)))
-
-    @property
     def settled(self) -> NDArray[np.bool_]:
         """Which points have parallax ``(N,)``."""
         return np.asarray(self._cosine < np.cos(_SETTLED))
 
     def by_rays(self, pixel_angle: float) -> FloatArray:
         """Sigmas of the logarithm of depth ``(N,)`` by rays that are known to ``pixel_angle`` radians."""
-        return np.asarray(pixel_angle / np.maximum(self.angle, 1e-9))
+        angle = np.arccos(np.clip(self._cosine, -1.0, 1.0))
+        return np.asarray(pixel_angle / np.maximum(angle, 1e-9))
 
     def prior_sigma(self, pixel_angle: float) -> FloatArray:
         """The same by learned depth ``(N,)``: errors that points share do not pull at what rays know."""
@@ -242,19 +239,15 @@ class LocalMap:
                 shared.append((points, k))
         fixed = sorted(k for _, k in sorted(shared, reverse=True)[:_ADJUSTED])
         chosen = [*fixed, *range(first, len(self.keyframes))]
-        sightings, track_ids = self.sightings(chosen, seen, intrinsics)
         limits = _YOUNG_LIMITS if len(self.keyframes) <= _YOUNG else _LIMITS
-        gone, dead = self.solve(
-            chosen, max(len(fixed), 1 + (first > 0)), sightings, track_ids, intrinsics, limits
-        )
+        gone, dead = self.solve(chosen, max(len(fixed), 1 + (first > 0)), seen, intrinsics, limits)
         return np.concatenate([dead, gone[-1]])
 
     def solve(
         self,
         chosen: Sequence[int],
         fixed: int,
-        sightings: Sightings,
-        track_ids: TrackIds,
+        seen: NDArray[np.bool_],
         intrinsics: Intrinsics,
         limits: tuple[int, float],
         outlier_px: float = OUTLIER_PX,
@@ -264,8 +257,7 @@ class LocalMap:
         Args:
             chosen: rows of the keyframes.
             fixed: how many of them stay, the first ones.
-            sightings: of the chosen keyframes, by `sightings`.
-            track_ids: of their points, by `sightings`.
+            seen: the points that take part ``(N,)``, where two of these keyframes see them.
             intrinsics: of all images.
             limits: iterations, and the relative fall of the cost at which it ends.
             outlier_px: residual of a sighting that is taken out, pixels.
@@ -274,6 +266,7 @@ class LocalMap:
             Tracks whose sightings were taken out of each keyframe as outliers, and those that
             thereby lost their point.
         """
+        sightings, track_ids = self.sightings(chosen, seen, intrinsics)
         free = np.arange(len(chosen)) >= fixed
         poses = np.array([self.keyframes[k].T_camera_world for k in chosen])
         problem = BundleAdjustment(sightings, intrinsics, free)
@@ -295,19 +288,14 @@ class LocalMap:
     ) -> tuple[Sightings, TrackIds]:
         """Sightings of the points seen by at least two of the chosen keyframes, and the points' tracks."""
         keyframes = [self.keyframes[k] for k in chosen]
-        known = [seen[keyframe.track_ids] for keyframe in keyframes]
-        camera = np.repeat(np.arange(len(chosen)), [rows.sum() for rows in known])
-
-        def joined(parts: Iterable[NDArray[Any]]) -> NDArray[Any]:
-            return np.concatenate([part[rows] for part, rows in zip(parts, known, strict=True)])
-
-        track = joined(keyframe.track_ids for keyframe in keyframes)
-        pixel = joined(keyframe.pixels for keyframe in keyframes)
-        depth = joined(keyframe.learned_depth for keyframe in keyframes)
-        sigma = self.parallax(keyframes).prior_sigma(PIXEL_SIGMA / intrinsics.fx)[track]
-        twice = np.bincount(track, minlength=len(self.points))[track] > 1
-        points, row_of = np.unique(track[twice], return_inverse=True)
-        return Sightings(camera[twice], row_of, pixel[twice], depth[twice], sigma[twice]), points
+        track = np.concatenate([keyframe.track_ids for keyframe in keyframes])
+        pixel = np.concatenate([keyframe.pixels for keyframe in keyframes])
+        depth = np.concatenate([keyframe.learned_depth for keyframe in keyframes])
+        camera = np.repeat(np.arange(len(chosen)), [len(each.track_ids) for each in keyframes])
+        rows = np.flatnonzero(seen[track] & (np.bincount(track)[track] > 1))
+        sigma = self.parallax(keyframes).prior_sigma(PIXEL_SIGMA / intrinsics.fx)[track[rows]]
+        points, row_of = np.unique(track[rows], return_inverse=True)
+        return Sightings(camera[rows], row_of, pixel[rows], depth[rows], sigma), points
 
     def ratios(self, keyframe: TrackedKeyframe) -> FloatArray:
         """Depth in the map over learned depth ``(M,)`` of a keyframe's corners, NaN where one is unknown."""
@@ -339,15 +327,11 @@ class LocalMap:
         for keyframe in self._near(T_camera_world, track_ids):
             rows = np.flatnonzero(attempts[keyframe.track_ids])
             X = apply(T_camera_world, self.points[keyframe.track_ids[rows]])
-            z = np.where(X[:, 2] > 0, X[:, 2], 1.0)
-            focal, centre = (intrinsics.fx, intrinsics.fy), (intrinsics.cx, intrinsics.cy)
-            projected = (X[:, :2] / z[:, None] * focal + centre).astype(np.float32)
+            ahead = X[:, 2] > 0
+            X[~ahead, 2] = 1.0
+            projected = intrinsics.project(X).astype(np.float32)
             limit = [intrinsics.width - _BORDER_PX, intrinsics.height - _BORDER_PX]
-            inside = (
-                (X[:, 2] > 0)
-                & (projected > _BORDER_PX).all(axis=1)
-                & (projected < limit).all(axis=1)
-            )
+            inside = ahead & ((projected > _BORDER_PX) & (projected < limit)).all(axis=1)
             rows, projected = rows[inside], projected[inside]
             if len(rows) < _LEAST_MATCHED:
                 continue
@@ -401,15 +385,44 @@ class NewImage:
         self, keyframe: TrackedKeyframe, rows: NDArray[np.intp], guesses: Pixels
     ) -> tuple[Pixels, NDArray[np.bool_]]:
         """Some corners of a keyframe from guesses ``(M, 2)``, and which were found ``(M,)``."""
-        if keyframe.grey is None:
-            return guesses, np.zeros(len(rows), np.bool_)
+        turned, pixels = self._as_turned(keyframe)
+        matched, kept = track(turned, self._grey, pixels[rows], _MATCHED, guesses)
+        return matched, kept & are_inside(matched, self._grey.shape)
+
+    def flowed(self, keyframe: TrackedKeyframe) -> tuple[TrackIds, Pixels]:
+        """Corners of the last keyframe by dense optical flow, where steps are too large for that of corners."""
+        turned, pixels = self._as_turned(keyframe)
+        flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        unknown = np.zeros((0, 0), np.float32)
+        there = flow.calc(turned, self._grey, unknown)
+        back = flow.calc(self._grey, turned, unknown)
+        rows = np.flatnonzero(are_inside(pixels, self._grey.shape))
+        flowed = pixels[rows] + _at(there, pixels[rows])
+        kept = are_inside(flowed, self._grey.shape)
+        rows, flowed = rows[kept], flowed[kept]
+        returned = flowed + _at(back, flowed)
+        kept = np.linalg.norm(returned - pixels[rows], axis=1) < _RETURNED_PX
+        rows, flowed = rows[kept], flowed[kept]
+        matched, kept = self.matched(keyframe, rows, flowed)
+        kept &= np.linalg.norm(matched - flowed, axis=1) < _REFINED_PX
+        flowed[kept] = matched[kept]
+        return keyframe.track_ids[rows], flowed
+
+    def _as_turned(self, keyframe: TrackedKeyframe) -> tuple[Grey, Pixels]:
+        """The image, which is kept, of a keyframe as the new camera is turned, and its corners ``(M, 2)`` there."""
+        assert keyframe.grey is not None
         K = self.intrinsics.K
         H = K @ (self.T_camera_world[:3, :3] @ keyframe.T_camera_world[:3, :3].T) @ np.linalg.inv(K)
         if keyframe.index not in self._turned:
             size = self.intrinsics.width, self.intrinsics.height
             turned = cv2.warpPerspective(keyframe.grey, H, size, borderMode=cv2.BORDER_REPLICATE)
             self._turned[keyframe.index] = np.asarray(turned, np.uint8)
-        moved = np.column_stack([keyframe.places[rows], np.ones(len(rows))]) @ H.T
+        moved = np.column_stack([keyframe.places, np.ones(len(keyframe.places))]) @ H.T
         pixels = (moved[:, :2] / moved[:, 2:]).astype(np.float32)
-        matched, kept = track(self._turned[keyframe.index], self._grey, pixels, _MATCHED, guesses)
-        return matched, kept & are_inside(matched, self._grey.shape)
+        return self._turned[keyframe.index], pixels
+
+
+def _at(flow: NDArray[np.float32], pixels: Pixels) -> Pixels:
+    """Flow ``(H, W, 2)`` at the nearest pixels ``(M, 2)``, inside."""
+    x, y = np.rint(pixels).astype(np.intp).T
+    return np.asarray(flow[y, x])

@@ -40,8 +40,7 @@ from slam.frontend.keyframes.relocalisation import Relocaliser
 from slam.frontend.tracking import KEYFRAME_SEARCH, Pixels, are_inside, new_corners, track
 from slam.geometry.multiview import INLIER_PX, MIN_POINTS, Resection, parallax_px, resect
 from slam.geometry.se3 import FloatArray, apply, compose, invert, make
-from slam.loops.features import describe, hamming
-from slam.loops.verification import OF_KEYFRAMES, mutual
+from slam.loops.features import describe
 
 logger = logging.getLogger(__name__)
 
@@ -64,7 +63,7 @@ _YOUNG_KEYFRAMES = 4
 _DOUBTFUL_PARALLAX_RATIO = 0.005
 _LOOKED_BACK = 4  # keyframes between which points have parallax before a first motion
 _MAX_CORNERS = 500  # of a keyframe
-_MATCHED_RATIO = 0.125  # within which descriptors match where flow fails, over the image width
+_DOUBTFUL_RATIO = 0.5  # of inliers, below which corners are sought by dense flow
 _NOTHING: tuple[TrackIds, Pixels] = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
 
 
@@ -171,12 +170,13 @@ class KeyframeOdometry:
         if self._locate(segment, frame, track_ids, pixels):
             return
         turn = image_turn(*images) if turn is None else turn
-        is_sure = turn.correlation > _SURE_CORRELATION and not self._lost
-        if not is_sure and self._locate(segment, frame, *self._matched(segment, frame, turn)):
-            return
         self._T_last_step = make(turn.R_now_before, np.zeros(3))
-        if is_sure:
-            self._T_camera_world = compose(self._T_last_step, self._T_camera_world)
+        T_turned = compose(self._T_last_step, self._T_camera_world)
+        image = NewImage(frame.grey, T_turned, self._intrinsics)
+        if self._locate(segment, frame, *image.flowed(segment.keyframes[-1]), is_doubtful=True):
+            return
+        if turn.correlation > _SURE_CORRELATION and not self._lost:
+            self._T_camera_world = T_turned
             self._add_keyframe(segment, frame, *_NOTHING)
             segment.frames.append(TrackedFrame(frame.index, *_NOTHING, self._T_camera_world))
             return
@@ -234,24 +234,20 @@ class KeyframeOdometry:
         self._places[rows] = np.where(kept[:, None], tracked, guesses + shift)
         return keyframe.track_ids[rows[kept]], tracked[kept]
 
-    def _matched(self, segment: LocalMap, frame: Frame, turn: ImageTurn) -> tuple[TrackIds, Pixels]:
-        """Corners of the last keyframe found by descriptors, near where the turn of the image moves them."""
-        keyframe = segment.keyframes[-1]
-        R_before_keyframe = self._T_camera_world[:3, :3] @ keyframe.T_camera_world[:3, :3].T
-        guesses = turned(keyframe.places, turn.R_now_before @ R_before_keyframe, self._intrinsics)
-        corners = new_corners(frame, _NOTHING[1], _MAX_CORNERS)
-        distance = hamming(keyframe.descriptors, describe(frame.grey, corners))
-        apart = np.linalg.norm(guesses[:, None] - corners, axis=2)
-        distance[apart > _MATCHED_RATIO * self._intrinsics.width] = np.inf
-        rows, found = mutual(distance, OF_KEYFRAMES)
-        return keyframe.track_ids[rows], corners[found]
-
-    def _locate(self, segment: LocalMap, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> bool:
-        """The camera's pose from known points; whether there are enough."""
+    def _locate(
+        self,
+        segment: LocalMap,
+        frame: Frame,
+        track_ids: TrackIds,
+        pixels: Pixels,
+        is_doubtful: bool = False,
+    ) -> bool:
+        """The camera's pose from known points; whether enough fit, most of them unless the frame ``is_doubtful``."""
         known = segment.known(track_ids)
         places, pixels = pixels, in_middle_row(pixels, self._turn_rate, self._intrinsics)
         pose = self._resected(segment, track_ids[known], pixels[known])
-        if pose is None:
+        least = 0.0 if is_doubtful else _DOUBTFUL_RATIO * known.sum()
+        if pose is None or len(pose.inliers) < least:
             return False
         self._lost = 0
         before, self._T_camera_world = self._T_camera_world, pose.T_camera_world
@@ -266,7 +262,7 @@ class KeyframeOdometry:
         are_few = len(track_ids) < max(_KEYFRAME_TRACKS_RATIO * len(last.track_ids), MIN_POINTS)
         if are_few or parallax > limit or flow > _MOST_FLOW * limit:
             if parallax > _DOUBTFUL_PARALLAX_RATIO:
-                self._check_first_motion(segment, track_ids, pixels)
+                self._check_first_motion(segment, track_ids, pixels, is_doubtful)
             self._add_keyframe(segment, frame, track_ids, places)
         segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, self._T_camera_world))
         return True
@@ -281,9 +277,7 @@ class KeyframeOdometry:
         if self._spread is None:
             self._spread = segment.spread(self._intrinsics)
         spread = self._spread[np.searchsorted(segment.keyframes[-1].track_ids, track_ids)]
-        before = np.zeros(0, np.bool_)
-        if segment.frames:
-            before = np.isin(track_ids, segment.frames[-1].track_ids)
+        before = np.isin(track_ids, [last.track_ids for last in segment.frames[-1:]])
         trusted = before if before.sum() >= MIN_POINTS else None
         pose = resect(
             guesses,
@@ -296,16 +290,17 @@ class KeyframeOdometry:
         )
         return pose if len(pose.inliers) >= MIN_POINTS else None
 
-    def _check_first_motion(self, segment: LocalMap, track_ids: TrackIds, pixels: Pixels) -> None:
-        """The best motion since the last keyframe, and its points, where these had no parallax before."""
+    def _check_first_motion(
+        self, segment: LocalMap, track_ids: TrackIds, pixels: Pixels, is_doubtful: bool
+    ) -> None:
+        """The best motion since the last keyframe, and its points, where it is doubtful or these had no parallax."""
         before = segment.keyframes[-1]
-        rows = np.searchsorted(before.track_ids, track_ids)
         known = segment.known(track_ids)
         settled = segment.parallax(segment.keyframes[-_LOOKED_BACK:]).settled[track_ids]
-        if settled.sum() >= MIN_POINTS:
+        if settled.sum() >= MIN_POINTS and not is_doubtful:
             return
         tracks = track_ids[known]
-        pixels_before = before.pixels[rows[known]]
+        pixels_before = before.pixels[np.searchsorted(before.track_ids, tracks)]
         now = pixels[known].astype(np.float64)
         depth = apply(before.T_camera_world, segment.points[tracks])[:, 2]
         T = self._T_camera_world @ invert(before.T_camera_world)

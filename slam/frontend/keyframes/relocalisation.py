@@ -41,17 +41,16 @@ class Relocaliser:
             where the image sees them, and the frame of the keyframe with most of them.
         """
         keyframes, rows, points = self._matched(image)
-        best: Sighting | None = None
+        located: list[Sighting] = []
         for keyframe in np.unique(keyframes):
             here = keyframes == keyframe
             pixels = image.pixels[rows[here, 1]]
             seen = self._verifier.resect(points[here].astype(np.float32), pixels)
-            if isinstance(seen, str):
-                continue
-            if best is None or len(seen.inliers) > len(best.inliers):
-                best = seen
-        if best is None:
+            if not isinstance(seen, str):
+                located.append(seen)
+        if not located:
             return None
+        best = max(located, key=lambda seen: len(seen.inliers))
         X = apply(best.T_camera_points, points)
         ahead = X[:, 2] > 0
         X[~ahead, 2] = 1.0

@@ -200,7 +200,7 @@ def _sigmas(local: LocalMap, intrinsics: Intrinsics) -> FloatArray:
     sigmas = []
     for keyframe in local.keyframes:
         tracks = keyframe.track_ids[local.known(keyframe.track_ids)]
-        depth_sigmas = np.maximum(pixel / np.maximum(parallax.angle[tracks], 1e-6), _POINT_SIGMA)
+        depth_sigmas = np.maximum(parallax.by_rays(pixel)[tracks], _POINT_SIGMA)
         weight = _INDEPENDENT * float((depth_sigmas**-2.0).sum()) / max(len(tracks), 1)
         sigmas.append(1.0 / np.sqrt(max(weight, 1e-9)))
         parallax.see(keyframe.T_camera_world, tracks)
@@ -235,19 +235,10 @@ def join(
     joined = _renumbered(united, tracks)
     everything = range(len(keyframes))
     for limit in _OUTLIER_LIMITS:
-        sightings, track_ids = joined.sightings(
-            everything, np.isfinite(joined.points[:, 0]), intrinsics
-        )
-        gone, _ = joined.solve(
-            everything, 1, sightings, track_ids, intrinsics, _LIMITS, limit * OUTLIER_PX
-        )
+        seen = np.isfinite(joined.points[:, 0])
+        gone, _ = joined.solve(everything, 1, seen, intrinsics, _LIMITS, limit * OUTLIER_PX)
         outliers = sum(map(len, gone))
-        logger.info(
-            "all %d keyframes adjusted: %d sightings, %d outliers",
-            len(everything),
-            len(sightings),
-            outliers,
-        )
+        logger.info("all %d keyframes adjusted: %d outliers", len(everything), outliers)
     kept_ratios = []
     for earlier, later, corners in shared:
         kept = np.ones(len(corners), np.bool_)

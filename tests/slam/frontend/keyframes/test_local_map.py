@@ -1,9 +1,10 @@
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from slam.frames import Intrinsics
-from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
+from slam.frontend.keyframes.local_map import LocalMap, NewImage, TrackedKeyframe
 from slam.geometry.se3 import FloatArray, apply, invert, make
 
 CAMERA = Intrinsics(640, 480, 500.0, 500.0, 319.5, 239.5)
@@ -110,3 +111,24 @@ def test_adjustment_takes_the_unit_of_loose_points_from_themselves() -> None:
     local.adjust(CAMERA)
     np.testing.assert_allclose(local.points, points, rtol=1e-3)
     np.testing.assert_allclose(local.keyframes[-1].T_camera_world, invert(along(0.6)), atol=1e-4)
+
+
+def test_a_step_of_a_sixth_of_the_image_is_followed_by_dense_flow() -> None:
+    """A wall 4 m away whose texture has all sizes; corners that left the image are not found."""
+    rng = np.random.default_rng(0)
+    wall = np.zeros((800, 1200))
+    for size in 2 ** np.arange(1, 8):
+        grain = rng.normal(size=(800 // size + 1, 1200 // size + 1))
+        wall += size * cv2.resize(grain, (1200, 800), interpolation=cv2.INTER_CUBIC)
+    image = np.rint(np.clip(128.0 + 0.4 * wall, 0.0, 255.0)).astype(np.uint8)
+    pixels = rng.uniform(20.0, [620.0, 460.0], (200, 2))
+    shift = np.array([100.0, 30.0])
+    tracks, nothing = np.arange(200), np.zeros((200, 32), np.uint8)
+    here, there = image[100:580, 200:840].copy(), image[70:550, 100:740].copy()
+    keyframe = TrackedKeyframe(0, np.eye(4), tracks, pixels, pixels, pixels[:, 0], nothing, here)
+    found, flowed = NewImage(there, np.eye(4), CAMERA).flowed(keyframe)
+    is_inside = (pixels + shift < [CAMERA.width - 1, CAMERA.height - 1]).all(axis=1)
+    assert is_inside[found].all()
+    right = np.linalg.norm(flowed - pixels[found] - shift, axis=1) < 1.0
+    assert right.sum() > 0.7 * is_inside.sum()
+    assert right.mean() > 0.9

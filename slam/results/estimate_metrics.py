@@ -128,8 +128,10 @@ def _motion(result: Estimate) -> records.MotionMetrics | Failed:
     window = min(_TOP_SPEED_S, span)
     begins = seconds[seconds <= seconds[-1] - window]
     ahead = np.interp(begins + window, seconds, path) - path[: len(begins)]
-    standing = [each for each in result.drive.motions if each.relative_pose.source == STILL_SOURCE]
-    steps = {each.ends for each in standing if each.ends[1] - each.ends[0] == 1}
+    stills = (
+        each.ends for each in result.drive.motions if each.relative_pose.source == STILL_SOURCE
+    )
+    steps = {ends for ends in stills if ends[1] - ends[0] == 1}
     return records.MotionMetrics.of(
         path=float(path[-1]),
         mean_speed=float(path[-1] / span),

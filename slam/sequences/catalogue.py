@@ -232,13 +232,13 @@ class SimulatedSequence(RecordedSequence):
     ``reference`` is re-based to the first camera; ``street.T_world_camera[0]`` takes it to the street.
     """
 
-    def __init__(self, options: SimulationOptions, name: str = "sim") -> None:
+    def __init__(self, options: SimulationOptions) -> None:
         street = self.street = simulated_world(options)
         rendered = functools.lru_cache(maxsize=_CACHED_FRAMES)(
             lambda index: street.render(index).image
         )
         super().__init__(
-            name,
+            "sim",
             ReadImages(
                 options.width,
                 options.height,

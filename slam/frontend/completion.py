@@ -14,6 +14,7 @@ from slam.frontend.gaps import interpolate_gaps
 from slam.frontend.keyframes.relative_poses import NO_MAPS, KeyframePoses
 from slam.frontend.road import with_slope
 from slam.frontend.rotations import smooth_rotations
+from slam.runtime.errors import Failed
 
 _LONGEST_GAP = 30  # interpolated frames, after which the place is only guessed
 
@@ -100,10 +101,12 @@ def complete_drive(
     cuts = find_cuts(drive.failures, measured, {*drive.unusable, *drive.repeated})
     filled = interpolate_gaps(drive, sources, cuts, map_poses)
     smoothed = smooth_rotations(filled.steps, drive.relative_rotations)
+    has_road = not drive.is_upside_down
     return replace(
         filled,
         motions=list(smoothed.values()),
-        road_steps=with_slope(drive.road_steps, smoothed),
+        road_steps=with_slope(drive.road_steps, smoothed) if has_road else {},
+        roads=drive.roads if has_road else [Failed("the images are upside down")] * len(drive),
         segments=find_segments(len(drive), cuts, filled.interpolated, map_poses.relates),
         map_poses=map_poses,
         events=sorted([*drive.events, *joins], key=lambda event: event.frame),

@@ -37,6 +37,8 @@ T = TypeVar("T")
 MAP_WIDTH_PX = 416  # of the depth that is fused: that of the networks
 _MOST_NAMED = 10  # stretches of frames in a sentence
 LAST_STEPS = 4  # in which the step to one of the last frames is looked up
+# least steps that tell, and their share: of upright vehicles 0.86 to 1 have nearer corners below
+_LEAST_VOTES, _UPSIDE_DOWN = 30, 1 / 3
 DOUBLED = "the image repeats the one before while the camera moves"
 
 
@@ -98,7 +100,8 @@ class Drive:
         which the camera moved. ``depth_error`` is that of learned depth and ``focal_length`` the
         one that corners show, as the steps have them. ``maps`` are those of keyframes and
         ``events`` what became of them; a drive measured by steps alone has none. ``fixed`` is the
-        part of the last image that is fixed to the camera.
+        part of the last image that is fixed to the camera. ``below_is_nearer`` says of each step
+        whether its corners below the axis are nearer than those above, as over any ground.
 
     Added by `slam.frontend.completion.complete_drive`, which also leaves out views and keyframes of
     interpolated frames, fills ``snippets`` to one a target, and smooths the rotations of
@@ -122,6 +125,7 @@ class Drive:
     depth_error: DepthError = field(default_factory=DepthError)
     focal_length: FocalLength = field(default_factory=FocalLength)
     fixed: Mask | None = None
+    below_is_nearer: list[bool] = field(default_factory=list)
 
     trusted: list[SnippetPoses] = field(default_factory=list)
     interpolated: dict[int, str] = field(default_factory=dict)
@@ -158,6 +162,14 @@ class Drive:
         """`frame_support` of all frames ``(N,)``; None where maps of keyframes give the poses."""
         return None if self.maps else frame_support(range(len(self)), self.motions)
 
+    @property
+    def is_upside_down(self) -> bool:
+        """Whether the images show the world upside down, so that what looks like a road is the sky."""
+        votes = self.below_is_nearer
+        if self.maps or len(votes) < _LEAST_VOTES:  # a camera that is carried looks anywhere
+            return False
+        return sum(votes) < _UPSIDE_DOWN * len(votes)
+
     def last_step(self, index: int) -> Motion | None:
         """The step to one of the last frames, where image geometry measured it."""
         return next(
@@ -184,7 +196,7 @@ class Drive:
         def renumbered(ends: Ends) -> Ends:
             return ends[0] - first, ends[1] - first
 
-        window = Drive(roads=self.roads[first:])
+        window = Drive(roads=self.roads[first:], below_is_nearer=self.below_is_nearer)
         for snippet in last(reversed(self.snippets), lambda snippet: min(snippet.sources)):
             target = snippet.target - first
             sources = tuple(source - first for source in snippet.sources)

@@ -116,6 +116,7 @@ class Observer:
         self._last_found: Mask | None = None  # and, joined with the mask that was given:
         self._last_joined: Mask | None = None
         self._odometry = VisualOdometry(intrinsics, seed)
+        self.drive.below_is_nearer = self._odometry.below_is_nearer
         self.keyframes = KeyframeTracking(
             config.keyframes, config.loops, intrinsics, seed, camera_height_m, self._ask_depth
         )

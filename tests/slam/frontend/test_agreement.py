@@ -98,6 +98,7 @@ def driven(
     aside: int = 0,
     weak: int = 0,
     focal_sigma: float = 0.0,
+    turned: int = 0,
 ) -> float:
     """The confidence of a drive by its images."""
     poses = [RelativePose(k, k + 1, T, np.full(6, 0.01), "essential") for k, T in enumerate(STEPS)]
@@ -110,6 +111,7 @@ def driven(
         roads=[Failed("not asked")] * (FRAMES + 1),
         segments=[Segment(k, k, "another place") for k in range(segments)],
         focal_length=FocalLength(1e6, -1e6 * focal),
+        below_is_nearer=[k >= turned for k in range(FRAMES)],
     )
     camera = replace(CAMERA, focal_sigma=focal_sigma)
     ends = [pose.ends for pose in poses[:contradicted]]
@@ -134,6 +136,7 @@ def driven(
         {"aside": 8},
         {"weak": 10},
         {"focal_sigma": 0.1},
+        {"turned": 35},
     ],
     ids=str,
 )

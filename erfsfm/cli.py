@@ -60,6 +60,10 @@ def train(
             help="KITTI odometry or raw root, image folder, video or prepared folder; repeat"
         ),
     ] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option(help="camera.yaml of images and videos, in place of the one beside them"),
+    ] = None,
     output: Annotated[Path, typer.Option(help="receives weights, checkpoints and logs")] = Path(
         "runs/train"
     ),
@@ -94,16 +98,16 @@ def train(
     experiment = load_experiment(config, changes).with_roots(dataset or [])
     with progress_bar() as progress:
         if prepare is not None:
-            prepare_training(experiment, prepare, progress)
+            prepare_training(experiment, prepare, progress, camera)
             typer.echo(f"train with: erfsfm train --config {config} --dataset {prepare}")
             return
-        folder = run_training(experiment, output, resume, device, _command(), progress)
+        folder = run_training(experiment, output, resume, device, _command(), progress, camera)
         typer.echo(f"weights in {folder}: use them with --weights {folder}")
         typer.echo(_how_good(folder))
         if experiment.initial_weights in UNTRAINED or experiment.data.validation_share == 0:
             return
         try:
-            rows = depth_before_and_after(experiment, folder, device, progress)
+            rows = depth_before_and_after(experiment, folder, device, progress, camera)
         except ErfsfmError as error:
             logger.warning("depth before and after training was not compared: %s", error)
             return

@@ -102,7 +102,16 @@ def data_root() -> Path:
 
 
 _A = dict.fromkeys(
-    ("ate_rmse_m", "t_rel_percent", "r_rel_deg_per_100m", "rpe_trans_m", "rpe_rot_deg", "scale"),
+    (
+        "ate_rmse_m",
+        "t_rel_percent",
+        "r_rel_deg_per_100m",
+        "rpe_trans_m",
+        "rpe_trans_rmse_m",
+        "rpe_rot_deg",
+        "rpe_rot_rmse_deg",
+        "scale",
+    ),
     float,
 )
 _T = {

@@ -47,20 +47,24 @@ logger = logging.getLogger(__name__)
 Number = TypeVar("Number", int, str)
 
 
-def discover(root: Path) -> list[Recording]:
+def discover(root: Path, camera: Path | None = None) -> list[Recording]:
     """All recordings under a root, two folders deep, sorted by name; ``DataError`` where there is none.
+
+    Args:
+        root: a data set, a folder or a file.
+        camera: the camera file of a user's images and videos, in place of those beside them.
 
     Raises:
         DataError: no recording found.
     """
     if not root.exists():
         raise DataError(f"no data set at {root}: the path does not exist")
-    found = _recordings_at(root)
+    found = _recordings_at(root, camera)
     if not found and root.is_dir():
         visible = (p for p in root.iterdir() if not p.name.startswith("."))
         children = sorted(p for p in visible if p.is_dir() or p.suffix.lower() in VIDEO_SUFFIXES)
         for child in children:
-            found += _recordings_at(child)
+            found += _recordings_at(child, camera)
     if not found:
         entries = (
             ", ".join(sorted(p.name for p in root.iterdir())[:8]) if root.is_dir() else root.name
@@ -107,7 +111,7 @@ def named_recordings(root: Path, name: str) -> list[Recording]:
     return chosen
 
 
-def _recordings_at(root: Path) -> list[Recording]:
+def _recordings_at(root: Path, camera: Path | None) -> list[Recording]:
     if (root / INDEX_FILE).is_file():
         return read_prepared(root)
     odometry = find_odometry_root(root)
@@ -121,7 +125,7 @@ def _recordings_at(root: Path) -> list[Recording]:
         for drive in drives.values():
             found += open_drive(drive)
         return found
-    return _own(root)
+    return _own(root, camera)
 
 
 def _odometry(root: OdometryRoot, sequence: Path) -> list[Recording]:
@@ -194,22 +198,25 @@ def _cameras(
         yield camera, files, first_size(files.paths)
 
 
-def _own(root: Path) -> list[Recording]:
-    """A user's images or videos with their camera.yaml; empty where there is neither."""
+def _own(root: Path, given: Path | None) -> list[Recording]:
+    """A user's images or videos with the ``given`` camera file or their camera.yaml; empty where there is neither."""
     is_video = root.is_file() and root.suffix.lower() in VIDEO_SUFFIXES
     home = root.parent if is_video else root
-    if not (home / CAMERA_FILE).is_file():
+    file = given or home / CAMERA_FILE
+    if not (given or file.is_file()):
         return []
-    written = read_camera_file(home / CAMERA_FILE)
+    written = read_camera_file(file)
     if written.is_distorted:
         raise DataError(
-            f"{home / CAMERA_FILE} describes a distorted camera: undistort the images before training"
+            f"{file} describes a distorted camera: undistort the images before training"
         )
     camera = Camera.of(written.pinhole)
     images: list[Path] = []
     if not is_video:  # those of a folder, or those of its one sub-folder of a usual name, or of the first that has any
         usual = image_folder(home)
-        folders = [usual] if usual is not None else sorted(filter(Path.is_dir, home.iterdir()))
+        folders = [] if usual is None else [usual]
+        if file.parent == home and not folders:
+            folders = sorted(filter(Path.is_dir, home.iterdir()))
         images = next((found for folder in folders if (found := list_images(folder))), [])
     if not images:
         videos = map(Video, [root] if is_video else list_videos(home))
@@ -224,7 +231,7 @@ def _own(root: Path) -> list[Recording]:
     if depth and not missing:  # as a depth camera measures it
         if written.depth_per_metre is None:
             raise DataError(
-                f"{home / CAMERA_FILE}: add depth_per_metre, the value of one metre in {maps}: 1000 in mm"
+                f"{file}: add depth_per_metre, the value of one metre in {maps}: 1000 in mm"
             )
         height_m = written.height_or(None) or INDOOR_HEIGHT_M
         whole = replace(

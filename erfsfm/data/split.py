@@ -116,10 +116,16 @@ def usable(recordings: Sequence[Recording], length: int) -> list[Recording]:
     return kept
 
 
-def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recording]]:
+def split_recordings(
+    config: DataConfig, camera: Path | None = None
+) -> tuple[list[Recording], list[Recording]]:
     """Training and validation recordings of all roots.
 
     They are chosen by the configuration's split, ranges and exclusions; stops are left out.
+
+    Args:
+        config: that names the roots.
+        camera: the camera file of a user's images and videos, in place of those beside them.
 
     Raises:
         DataError: no roots, a name that fits no recording or kind of recordings, a range that begins
@@ -132,7 +138,9 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     division = _Division(config, split)
     found: list[Recording] = []
     for root in config.roots:
-        found += discover(root)
+        found += discover(root, camera)
+    if camera is not None and not any(each.name.startswith("folder/") for each in found):
+        raise DataError(f"--camera {camera} is for images and videos of your own: leave it out")
     division.require_found(found)
     training: list[Recording] = []
     validation: list[Recording] = []

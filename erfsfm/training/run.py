@@ -64,6 +64,7 @@ def train(
     device: str = "auto",
     command: str = "",
     progress: Progress = silent,
+    camera: Path | None = None,
 ) -> Path:
     """Train, validate, keep the best in the folder that is returned; further processes of several devices exit here.
 
@@ -76,6 +77,7 @@ def train(
         device: ``auto``, ``cpu`` or ``cuda``.
         command: recorded in the weights.
         progress: told of the stage, what is done, and of how many.
+        camera: the camera file of a user's images and videos, in place of those beside them.
 
     Raises:
         ConfigError, DataError, TrainingError: configuration, data or output folder cannot be used; one line.
@@ -91,7 +93,7 @@ def train(
     done_steps = folder.resumable_steps(config) if resume else 0
     if rank == 0 and not resume:  # the first process has written there before it starts the others
         folder.require_free()
-    training, validation = split_recordings(config.data)
+    training, validation = split_recordings(config.data, camera)
     if config.data.validation and not validation and rank == 0:
         logger.warning(
             "training runs without validation: no recording of data.validation is among the data"
@@ -128,7 +130,9 @@ def train(
     return output
 
 
-def prepare(config: ExperimentConfig, output: Path, progress: Progress = silent) -> None:
+def prepare(
+    config: ExperimentConfig, output: Path, progress: Progress = silent, camera: Path | None = None
+) -> None:
     """Write the frames and labels of a training to a folder, to train from elsewhere; see `write_prepared`.
 
     Raises:
@@ -144,7 +148,7 @@ def prepare(config: ExperimentConfig, output: Path, progress: Progress = silent)
         raise ConfigError(
             "--prepare keeps whole recordings to validate on: set data.validation_share=0"
         )
-    training, validation = split_recordings(config.data)
+    training, validation = split_recordings(config.data, camera)
     training = usable(training, config.network.sources + 1)
     held_out = ValidationSnippets(validation, config).snippets if validation else []
     with tempfile.TemporaryDirectory() as temporary:
@@ -155,7 +159,11 @@ def prepare(config: ExperimentConfig, output: Path, progress: Progress = silent)
 
 
 def depth_before_and_after(
-    config: ExperimentConfig, output: Path, device: str, progress: Progress
+    config: ExperimentConfig,
+    output: Path,
+    device: str,
+    progress: Progress,
+    camera: Path | None = None,
 ) -> list[dict[str, Any]]:
     """Errors by many views, a row for each held-out stretch by the initial weights, then by the trained ones.
 
@@ -164,11 +172,12 @@ def depth_before_and_after(
         output: its weights.
         device: ``auto``, ``cpu`` or ``cuda``.
         progress: told of the stage, what is done, and of how many.
+        camera: as of the training.
 
     Raises:
         DataError, TrainingError: no depth could be measured there.
     """
-    _, validation = split_recordings(config.data)
+    _, validation = split_recordings(config.data, camera)
     cache, rows = config.teacher.cache or output / MEASUREMENTS, []
     for when, weights in (("before", config.initial_weights), ("after", str(output))):
         networks = DepthPosePredictor.from_weights(weights, device)

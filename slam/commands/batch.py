@@ -28,7 +28,6 @@ from erfsfm.common.table import Table, csv_of
 from erfsfm.inference import record_of_whole_weights
 from slam.config.sections import load_config
 from slam.results.folder import RunFolder
-from slam.results.metrics import Metrics
 from slam.results.tables import written
 from slam.results.verdict import verdict
 from slam.runtime.errors import RunError, SequenceError, SlamError
@@ -42,33 +41,41 @@ _MANIFEST = ".csv"
 _KEYS = ("name", "dataset", "sequence", "camera", "options")
 _LOG_BEGIN = "erfsfm-slam run "  # a log begins with the command
 _CSV_BEGIN = "drive,status,reason"
-# columns of drives.csv, and their decimals on a terminal, which shows those that have some
-_COLUMNS: dict[str, tuple[Callable[[Metrics], object], int | None]] = {
-    "sequence": (lambda m: m.sequence.name, None),
-    "frames": (lambda m: m.sequence.frames, 0),
-    "length_m": (lambda m: m.sequence.length_m, 0),
-    "scale": (lambda m: m.scale.mode, None),
-    "unit": (lambda m: m.unit, 0),
-    "ate_6dof_m": (
-        lambda m: m.trajectories.optimised.align.dof6.ate_rmse_m if m.is_metric else None,
-        3,
-    ),
-    "ate_7dof_m": (lambda m: m.trajectories.optimised.align.dof7.ate_rmse_m, 3),
-    "t_rel_percent": (lambda m: m.trajectories.optimised.align.dof7.t_rel_percent, 2),
-    "r_rel_deg_per_100m": (lambda m: m.trajectories.optimised.align.dof7.r_rel_deg_per_100m, None),
-    "confidence": (lambda m: m.confidence.run, 2),
-    "path": (lambda m: m.motion.path, None),
-    "mean_speed": (lambda m: m.motion.mean_speed, None),
-    "top_speed": (lambda m: m.motion.top_speed, None),
-    "doubts": (lambda m: "; ".join(said.doubts) if (said := verdict(m)) else None, None),
-    "interpolated_frames": (lambda m: m.sequence.bridged_frames, None),
-    "loops": (lambda m: m.loops.accepted, None),
-    "map_triangles": (lambda m: m.map.triangles, None),
-    "leak": (lambda m: m.provenance.leak, None),
-    "seconds": (lambda m: m.timing.seconds_total, 1),
-    "frames_per_second": (lambda m: m.timing.frames_per_second, None),
-    "peak_rss_mb": (lambda m: m.timing.peak_rss_mb, None),
+_ERRORS = "trajectories.optimised.align"
+# columns of drives.csv, and their paths in the metrics; the doubts are those of the verdict
+_COLUMNS = {
+    "sequence": "sequence.name",
+    "frames": "sequence.frames",
+    "length_m": "sequence.length_m",
+    "scale": "scale.mode",
+    "unit": "unit",
+    "ate_6dof_m": f"{_ERRORS}.6dof.ate_rmse_m",
+    "ate_7dof_m": f"{_ERRORS}.7dof.ate_rmse_m",
+    "t_rel_percent": f"{_ERRORS}.7dof.t_rel_percent",
+    "r_rel_deg_per_100m": f"{_ERRORS}.7dof.r_rel_deg_per_100m",
+    "confidence": "confidence.run",
+    "path": "motion.path",
+    "mean_speed": "motion.mean_speed",
+    "top_speed": "motion.top_speed",
+    "doubts": "",
+    "interpolated_frames": "sequence.bridged_frames",
+    "loops": "loops.accepted",
+    "map_triangles": "map.triangles",
+    "leak": "provenance.leak",
+    "seconds": "timing.seconds_total",
+    "frames_per_second": "timing.frames_per_second",
+    "peak_rss_mb": "timing.peak_rss_mb",
 }
+# those on a terminal, and their decimals
+_SHOWN = {
+    "frames": 0,
+    "length_m": 0,
+    "unit": 0,
+    "ate_6dof_m": 3,
+    "ate_7dof_m": 3,
+    "t_rel_percent": 2,
+}
+_SHOWN |= {"confidence": 2, "seconds": 1}
 
 
 @dataclass(frozen=True)
@@ -254,17 +261,16 @@ def check_output(output: Path, drives: Sequence[Drive]) -> None:
 
 def summary_table(outcomes: Sequence[Outcome]) -> Table:
     """The main numbers of the runs that are whole, and why others failed."""
-    shown = {name: places for name, (_, places) in _COLUMNS.items() if places is not None}
     rows, notes = [], []
     for outcome in outcomes:
         if outcome.status == "failed":
             notes.append(f"{outcome.drive.name} failed: {outcome.reason}")
             continue
         row = _row(outcome)
-        numbers = (written(row[name], decimals) for name, decimals in shown.items())
+        numbers = (written(row[name], decimals) for name, decimals in _SHOWN.items())
         rows.append([row["drive"], row["status"], *numbers])
     return Table(
-        ["drive", "status", *(name.replace("_", "\n", 1) for name in shown)], rows, notes=notes
+        ["drive", "status", *(name.replace("_", "\n", 1) for name in _SHOWN)], rows, notes=notes
     )
 
 
@@ -349,11 +355,15 @@ def _is_whole(folder: Path, arguments: list[str]) -> bool:
 
 
 def _row(outcome: Outcome) -> dict[str, Any]:
-    row = {"drive": outcome.drive.name, "status": outcome.status, "reason": outcome.reason}
+    row: dict[str, Any] = dict.fromkeys(("drive", "status", "reason", *_COLUMNS))
+    row |= {"drive": outcome.drive.name, "status": outcome.status, "reason": outcome.reason}
     if outcome.status == "failed":
-        return row | dict.fromkeys(_COLUMNS)
+        return row
     metrics = RunFolder(outcome.folder).metrics()
-    return row | {name: value(metrics) for name, (value, _) in _COLUMNS.items()}
+    row |= {name: metrics.at(path)[0] for name, path in _COLUMNS.items() if path}
+    if (said := verdict(metrics)) is not None:
+        row["doubts"] = "; ".join(said.doubts)
+    return row if metrics.is_metric else row | {"ate_6dof_m": None}
 
 
 def _end_with_the_worker() -> None:

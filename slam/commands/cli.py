@@ -184,6 +184,10 @@ def evaluate(
     ] = None,
     frames: Annotated[str | None, typer.Option(help="A:B of the reference, half-open")] = None,
     format: Annotated[Literal["auto", "kitti", "tum"], typer.Option(help="of the files")] = "auto",
+    times: Annotated[
+        Path | None,
+        typer.Option(help="of the rows of KITTI files, as times.txt: compared by stamps"),
+    ] = None,
     csv: Annotated[Path | None, typer.Option(help="all numbers, with --reference")] = None,
     fail_over: Annotated[
         list[str] | None, typer.Option(help="METRIC=VALUE: exit 1 if it is larger; repeat")
@@ -205,7 +209,7 @@ def evaluate(
     files, limits = [Path(path) for path in paths], fail_over or []
     evaluation.require_metrics(limits)
     if reference is not None:
-        evaluation.against_reference(paths, reference, frames, format, limits, as_json, csv)
+        evaluation.against_reference(paths, reference, frames, format, limits, as_json, csv, times)
     elif frames or csv:
         raise typer.BadParameter("--frames and --csv need --reference FILE")
     elif all(path.is_dir() for path in files):
@@ -215,7 +219,7 @@ def evaluate(
             )
         evaluation.of_runs(files, as_json)
     elif len(files) == 2:
-        evaluation.of_two(files[0], files[1], format, limits, as_json)
+        evaluation.of_two(files[0], files[1], format, limits, as_json, times)
     else:
         given = ", ".join(paths)
         raise typer.BadParameter(

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import typer
 
+from erfsfm.common.readers.numbering import in_order
 from erfsfm.common.table import Table, csv_of
 from slam.evaluation.mistakes import likely_mistakes
 from slam.evaluation.trajectory import TrajectoryMetrics, evo_commands, exceeded, trajectory_metrics
@@ -21,7 +22,7 @@ from slam.results import tables
 from slam.results.folder import RunFolder, check_replaced
 from slam.runtime.errors import ConfigError, RunError, SlamError, TrajectoryError
 from slam.runtime.files import REFERENCE, trajectory_file, write_atomically
-from slam.sequences.recording import frame_range
+from slam.sequences.recording import frame_range, read_stamps
 
 logger = logging.getLogger(__name__)
 
@@ -42,11 +43,12 @@ def against_reference(
     limits: Sequence[str],
     as_json: bool,
     csv: Path | None,
+    times: Path | None = None,
 ) -> None:
     """Any number of trajectories against one truth, as a table of systems; `SlamError` where one is over its limit."""
     if csv is not None:
         check_replaced(csv, b"system,path")
-    runs = compare(named_paths(paths), reference, format, frames)
+    runs = compare(named_paths(paths), reference, format, frames, times)
     if csv is not None:
         write_atomically(csv, csv_of(dict(_flat(run.tree())) for run in runs), RunError)
     if as_json:
@@ -72,23 +74,26 @@ def of_runs(paths: Sequence[Path], as_json: bool) -> None:
 
 
 def of_two(
-    estimate: Path, reference: Path, format: str, limits: Sequence[str], as_json: bool
+    estimate: Path,
+    reference: Path,
+    format: str,
+    limits: Sequence[str],
+    as_json: bool,
+    times: Path | None = None,
 ) -> None:
     """One trajectory against another under every alignment, with the commands of evo that give the same.
 
     Raises:
         SlamError: a file cannot be read, or an error is over its limit.
     """
-    (run,) = compare([("", estimate)], reference, format)
+    (run,) = compare([("", estimate)], reference, format, times=times)
     if as_json:
         typer.echo(run.errors.to_json())
     else:
         tables.alignments_table(run.errors, f"{estimate.name} against {reference.name}").print()
         both = {estimate: "optimised", reference: REFERENCE}
-        timed = all(trajectory_at(path, format, name).timed for path, name in both.items())
-        kind = "tum" if timed else "kitti"
         files = [
-            path / trajectory_file(name, kind) if path.is_dir() else path
+            path / trajectory_file(name, "kitti") if path.is_dir() else path
             for path, name in both.items()
         ]
         typer.echo("\n".join(evo_commands(files[0], files[-1], format)))
@@ -138,10 +143,18 @@ def named_paths(words: Sequence[str]) -> list[tuple[str, Path]]:
     return [(str(path) if plain.count(name) > 1 else name, path) for name, path in found]
 
 
-def trajectory_at(path: Path, format: str = "auto", of_run: str = "optimised") -> Trajectory:
-    """A trajectory file, or one of the trajectories of a run folder."""
+def trajectory_at(
+    path: Path, format: str = "auto", of_run: str = "optimised", times: Path | None = None
+) -> Trajectory:
+    """A trajectory file, at ``times`` where its rows have none, or one of the trajectories of a run folder."""
     if not path.is_dir():
-        return read_trajectory(path, format)
+        given = read_trajectory(path, format)
+        if times is None or given.timed:
+            return given
+        numbers = given.frame_numbers
+        frames = max(given.frame_count, int(numbers[-1]) + 1)
+        stamps = read_stamps(times, in_order([path] * frames))[numbers]
+        return Trajectory(stamps, given.T_world_camera)
     trajectory = RunFolder.open(path).trajectory(of_run)
     if trajectory is None:
         raise RunError(f"{path} has no {of_run} trajectory: give a trajectory file, or another run")
@@ -153,6 +166,7 @@ def compare(
     reference: Path,
     format: str = "auto",
     frames: str | None = None,
+    times: Path | None = None,
 ) -> list[SystemRun]:
     """Errors of trajectories against one reference.
 
@@ -161,15 +175,16 @@ def compare(
         reference: a trajectory file, or a run folder with a reference.
         format: of the files.
         frames: ``A:B`` of the reference, half-open; a file of B - A rows without frame numbers is of these frames.
+        times: those of the rows of files without stamps, as KITTI's ``times.txt``.
 
     Raises:
         SlamError: a file cannot be read, or its poses do not belong to those of the reference.
     """
-    truth = trajectory_at(reference, format, REFERENCE)
+    truth = trajectory_at(reference, format, REFERENCE, times)
     chosen = None if frames is None else frame_range(frames, len(truth))
     runs = []
     for name, path in paths:
-        estimate = trajectory_at(path, format)
+        estimate = trajectory_at(path, format, times=times)
         try:
             pair = associate(estimate, truth, chosen)
         except TrajectoryError as error:

@@ -125,38 +125,41 @@ class LiveRecorder(FolderRecorder):
             index, self._said = self._said, self._said + 1
             at_s = sequence.arrived_s.get(index)
             support = None if newest.support is None else round(newest.support, 2)
-            message: dict[str, Any] = {
+            late_ms = None if at_s is None else round(1e3 * (time.monotonic() - at_s), 1)
+            message = {
                 "type": "pose",
                 "frame": index,
                 "stamp": float(sequence.stamps[index]),
-            }
-            message |= {
                 "state": newest.state,
                 "unit": self._poses.unit_name,
                 "scale": newest.unit,
                 "support": support,
+                # row by row as in KITTI's files
+                "T_world_camera": newest.T_world_camera[:3].ravel().tolist(),
+                "latency_ms": late_ms,
+                "dropped": sequence.dropped,
             }
-            # row by row as in KITTI's files
-            message |= {"T_world_camera": newest.T_world_camera[:3].ravel().tolist()}
-            late_ms = None if at_s is None else round(1e3 * (time.monotonic() - at_s), 1)
-            self._emit(message | {"latency_ms": late_ms, "dropped": sequence.dropped})
+            self._emit(message)
             if self._viewer is not None:
                 self._viewer.show(index, observer.measured, newest)
 
     def estimate(self, estimate: Estimate) -> None:
         """Also say all poses again as the whole drive gives them, and why it ended."""
         super().estimate(estimate)
-        sequence, trajectory, loops = (
-            self._sequence,
-            estimate.optimised,
-            len(estimate.loops.accepted),
-        )
-        state = "loop closed" if loops else "whole drive"
-        message: dict[str, Any] = {"type": "trajectory", "state": state, "loops": loops}
-        message |= {"unit": estimate.scale.unit_name, "run": str(self.folder.path)}
-        poses = trajectory.T_world_camera[:, :3].reshape(-1, 12).tolist()
-        message |= {"stamps": trajectory.stamps.tolist(), "T_world_camera": poses}
-        self._emit(message | {"dropped": sequence.dropped, "ended": sequence.ended})
+        sequence, trajectory = self._sequence, estimate.optimised
+        loops = len(estimate.loops.accepted)
+        message = {
+            "type": "trajectory",
+            "state": "loop closed" if loops else "whole drive",
+            "loops": loops,
+            "unit": estimate.scale.unit_name,
+            "run": str(self.folder.path),
+            "stamps": trajectory.stamps.tolist(),
+            "T_world_camera": trajectory.T_world_camera[:, :3].reshape(-1, 12).tolist(),
+            "dropped": sequence.dropped,
+            "ended": sequence.ended,
+        }
+        self._emit(message)
         if self._viewer is not None:
             self._viewer.correct(trajectory)
         (logger.warning if sequence.dropped else logger.info)(

@@ -66,15 +66,17 @@ class Localisation:
     def tree(self) -> dict[str, Any]:
         """For JSON: unknown values are null, with the reason."""
         T_world_camera = self.T_world_camera
-        entry: dict[str, Any] = {"image": self.image, "found": T_world_camera is not None}
         if T_world_camera is None:
-            values = dict.fromkeys(("position", "T_world_camera", "nearest_frame", "inliers"))
-            return entry | values | {"reason": self.reason}
-        entry |= {
+            unknown = dict.fromkeys(("position", "T_world_camera", "nearest_frame", "inliers"))
+            return {"image": self.image, "found": False, **unknown, "reason": self.reason}
+        return {
+            "image": self.image,
+            "found": True,
             "position": T_world_camera[:3, 3].tolist(),
             "T_world_camera": T_world_camera.tolist(),
+            "nearest_frame": self.nearest_frame,
+            "inliers": self.inliers,
         }
-        return entry | {"nearest_frame": self.nearest_frame, "inliers": self.inliers}
 
 
 def localise(

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import logging
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypedDict, Unpack
 
 import yaml
 from pydantic import BeforeValidator, Field, ValidationError
@@ -102,14 +102,8 @@ class Request(Section):
         """The request of arguments given by name.
 
         Raises:
-            TypeError: an unknown argument.
-            RunError: a value of another kind.
+            RunError: an unknown argument, or a value of another kind.
         """
-        if unknown := arguments.keys() - cls.model_fields.keys():
-            names = ", ".join(name for name in cls.model_fields if name != "command")
-            raise TypeError(
-                f"run_slam has no argument {', '.join(sorted(unknown))}; it has {names}"
-            )
         try:
             return cls(**arguments)
         except ValidationError as error:
@@ -118,14 +112,14 @@ class Request(Section):
     @property
     def recording(self) -> dict[str, str]:
         """The options that name the recording, files by their whole paths; none of the embedded street."""
-        given = {name: getattr(self, name, None) for name in _RECORDING}
-        named = {name: value for name, value in given.items() if value is not None}
-        return {
-            name: without_secrets(
-                from_anywhere(v) if name == "dataset" or isinstance(v, Path) else v
-            )
-            for name, v in named.items()
-        }
+        found = {}
+        for name in _RECORDING:
+            value = getattr(self, name, None)
+            if name == "dataset" or isinstance(value, Path):
+                value = value and from_anywhere(value)
+            if value is not None:
+                found[name] = without_secrets(value)
+        return found
 
 
 class RunRequest(Request):
@@ -287,26 +281,38 @@ class FolderRecorder(Recorder):
         return loop_pictures(estimate.loops.accepted, image, sequence.intrinsics)
 
 
+class RunOptions(TypedDict, total=False):
+    """The options of ``erfsfm-slam run`` from Python, for mypy and editors; `RunRequest` has their defaults."""
+
+    camera: str | Path | None
+    weights: str | Path
+    config: str | Path | None
+    overrides: Sequence[str] | None
+    frames: str | None
+    truth: str | Path | None
+    gps: str | Path | None
+    output: str | Path | None
+    rerun: str | Path | None
+    seed: int
+    device: Literal["auto", "cpu", "cuda"]
+    progress: Progress
+
+
 def run_slam(
-    dataset: str | Path | None = None, sequence: str | None = None, **options: Any
+    dataset: str | Path | None = None, sequence: str | None = None, **options: Unpack[RunOptions]
 ) -> RunFolder:
-    """Run the whole system on one sequence.
+    """Run the whole system on one sequence; the arguments are the options of ``erfsfm-slam run``.
 
     Without ``progress``, the log says every ten seconds (level INFO) what is done; in a notebook its cell does.
 
-    The arguments are those of `RunRequest`, by name; the run folder is returned.
-
     Raises:
-        TypeError: an unknown argument.
         SlamError, ErfsfmError: as `perform`.
     """
-    if options.get("progress") is not None:
-        return perform(RunRequest.of(dataset=dataset, sequence=sequence, **options))
     in_notebook = "ipykernel" in sys.modules
-    with progress_bar() if in_notebook else progress_lines(logger.info) as progress:
-        return perform(
-            RunRequest.of(dataset=dataset, sequence=sequence, **options | {"progress": progress})
-        )
+    shown = progress_bar() if in_notebook else progress_lines(logger.info)
+    with nullcontext(options["progress"]) if "progress" in options else shown as progress:
+        given = {**options, "progress": progress}
+        return perform(RunRequest.of(dataset=dataset, sequence=sequence, **given))
 
 
 def perform(request: RunRequest) -> RunFolder:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.evaluation.pose_metrics import SnippetErrors, snippet_errors, snippets_from_trajectory
+from slam.formats.rows import number_or_nan
 from slam.formats.trajectory import Trajectory, associate, matching_tolerance_s, read_trajectory
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
@@ -35,8 +36,6 @@ SEGMENT_STEP = 10
 ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)
 SNIPPET_LENGTH = 5
 _SAME_ROTATION = 1e-9  # of the entries of a matrix
-# With fewer frames an alignment fits exactly, and its zero error is meaningless.
-_FEWEST_FRAMES: dict[Alignment, int] = {"none": 2, "first": 2, "scale": 3, "6dof": 3, "7dof": 3}
 _TURNED_DEG = 20.0  # by one of two trajectories, where the other has the same rotation in every row
 _STRAIGHT = 0.02  # of the length of a path, across it
 _NO_REFERENCE = "there is no reference trajectory"
@@ -60,23 +59,26 @@ def aligned(trajectories: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
 
     Without a reference they stay as written, only the network trajectory is brought to the optimised one's scale.
     """
-    drawn = dict(trajectories)
-    if REFERENCE in drawn:
+    fits: dict[str, se3.Similarity] = {}
+    if REFERENCE in trajectories:
         for name in trajectories.keys() - {REFERENCE}:
-            estimate, truth = associate(drawn[name], drawn[REFERENCE])
-            fit = se3.umeyama(truth.positions, estimate.positions, with_scale=True)
-            drawn[name] = replace(
-                drawn[name], T_world_camera=fit.apply_to_poses(drawn[name].T_world_camera)
-            )
-    elif "network" in drawn and "optimised" in drawn:
-        raw, optimised = associate(drawn["network"], drawn["optimised"])
-        energy = float((raw.positions**2).sum())
-        scale = float((raw.positions * optimised.positions).sum()) / energy if energy > 0 else 1.0
-        fit = se3.Similarity(scale, np.eye(3), np.zeros(3))
-        drawn["network"] = replace(
-            drawn["network"], T_world_camera=fit.apply_to_poses(drawn["network"].T_world_camera)
-        )
+            estimate, truth = associate(trajectories[name], trajectories[REFERENCE])
+            fits[name] = se3.umeyama(truth.positions, estimate.positions, with_scale=True)
+    elif "network" in trajectories and "optimised" in trajectories:
+        raw, optimised = associate(trajectories["network"], trajectories["optimised"])
+        fits["network"] = _scaling(optimised.positions, raw.positions)
+    drawn = dict(trajectories)
+    for name, fit in fits.items():
+        T_world_camera = fit.apply_to_poses(drawn[name].T_world_camera)
+        drawn[name] = replace(drawn[name], T_world_camera=T_world_camera)
     return drawn
+
+
+def _scaling(positions_reference: FloatArray, positions: FloatArray) -> se3.Similarity:
+    """The scale of positions ``(N, 3)`` that fits the reference's best, s = sum(g . p) / sum(p . p)."""
+    energy = float((positions**2).sum())
+    scale = float((positions_reference * positions).sum()) / energy if energy > 0 else 1.0
+    return se3.Similarity(scale, np.eye(3), np.zeros(3))
 
 
 def paired(trajectories: Mapping[str, Trajectory]) -> Iterator[tuple[str, Trajectory, Trajectory]]:
@@ -176,9 +178,13 @@ class Statistic(NamedTuple):
     formula: Callable[[Aligned], float | Failed]
 
 
+def _rmse(errors: FloatArray) -> float:
+    return float(np.sqrt((errors**2).mean()))
+
+
 def _ate(pair: Aligned) -> float:
     offsets = pair.T_world_estimate[:, :3, 3] - pair.T_world_reference[:, :3, 3]
-    return float(np.sqrt((offsets**2).sum(axis=1).mean()))
+    return _rmse(np.linalg.norm(offsets, axis=1))
 
 
 _T_REL = Statistic(
@@ -191,6 +197,8 @@ _R_REL = Statistic(
 )
 _RPE_M = Statistic("RPE\nm", 4, lambda pair: float(pair.step_errors[0].mean()))
 _RPE_DEG = Statistic("RPE\ndeg", 4, lambda pair: float(np.rad2deg(pair.step_errors[1].mean())))
+_RPE_RMSE_M = Statistic("rmse\nm", 4, lambda pair: _rmse(pair.step_errors[0]))
+_RPE_RMSE_DEG = Statistic("rmse\ndeg", 4, lambda pair: _rmse(np.rad2deg(pair.step_errors[1])))
 
 
 class AlignedMetrics(Record):
@@ -200,7 +208,9 @@ class AlignedMetrics(Record):
     t_rel_percent: Annotated[float | None, _T_REL] = None
     r_rel_deg_per_100m: Annotated[float | None, _R_REL] = None
     rpe_trans_m: Annotated[float | None, _RPE_M] = None
+    rpe_trans_rmse_m: Annotated[float | None, _RPE_RMSE_M] = None
     rpe_rot_deg: Annotated[float | None, _RPE_DEG] = None
+    rpe_rot_rmse_deg: Annotated[float | None, _RPE_RMSE_DEG] = None
     scale: Annotated[float | None, Statistic("scale", 4, lambda pair: pair.scale)] = None
 
     @classmethod
@@ -290,9 +300,9 @@ def align(
 ) -> Aligned:
     """Bring an estimate to a reference, both ``(N, 4, 4)``.
 
-    ``none`` as written; ``first`` both rebased to their first pose; ``scale`` then also one factor,
-    s = sum(g . p) / sum(p . p); ``6dof`` and ``7dof`` the best rigid motion and the best similarity of the
-    positions. The scale of an estimate that stands still is undefined; it is left as it is.
+    ``none`` as written; ``first`` both rebased to their first pose; ``scale`` then also one factor; ``6dof`` and
+    ``7dof`` the best rigid motion and the best similarity of the positions. The scale of an estimate that stands
+    still is undefined; it is left as it is.
 
     Args:
         T_world_estimate: poses ``(N, 4, 4)``.
@@ -309,7 +319,7 @@ def align(
     if alignment in ("6dof", "7dof"):
         fit = se3.umeyama(g, p, with_scale=scaled and not still)
     elif scaled and not still:
-        fit = se3.Similarity(float((g * p).sum() / (p * p).sum()), np.eye(3), np.zeros(3))
+        fit = _scaling(g, p)
     scale = (
         Failed("the estimate does not move, so its scale is undefined")
         if scaled and still
@@ -360,10 +370,7 @@ def exceeded(metrics: TrajectoryMetrics, limits: Sequence[str]) -> list[str]:
     for limit in limits:
         name, _, text = limit.partition("=")
         name = name.strip()
-        try:
-            most = float(text)
-        except ValueError:
-            most = math.nan
+        most = number_or_nan(text)
         if not name or math.isnan(most):
             raise ConfigError(f"a limit is METRIC=VALUE with a number for VALUE; got '{limit}'")
         path = f"align.7dof.{name}" if name in names else name
@@ -412,7 +419,8 @@ def _alignment_metrics(
     """The object A: errors of all rows after one alignment; of positions alone where there are no rotations."""
     if unturned and alignment in ("first", "scale"):
         return AlignedMetrics.unknown(unturned)
-    frames, fewest = len(T_world_estimate), _FEWEST_FRAMES[alignment]
+    # with fewer frames an alignment fits exactly, and its zero error is meaningless
+    frames, fewest = len(T_world_estimate), 2 if alignment in ("none", "first") else 3
     if frames < fewest:
         return AlignedMetrics.unknown(f"this alignment needs {fewest} frames; there are {frames}")
     if alignment in ("scale", "7dof") and _stands_still(T_world_reference):

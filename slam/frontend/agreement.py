@@ -226,6 +226,9 @@ def of_images(
     corners_were_asked = bool(drive.steps or drive.measured.failures)
     if corners_were_asked and (support := drive.support) is not None:
         compared("the overlap of images", *_overlap(support))
+    if drive.measured.is_upside_down:
+        figure = "what is high in the images is nearer than what is low: turn them by 180 degrees"
+        compared("the way up of the camera", 2.0 * WRONG, figure)
     if needs_road and steps >= _LEAST:
         sigmas = (_ON_ROAD - on_road / steps) / _ON_ROAD_SPREAD
         figure = f"{on_road} of {steps} lengths were measured on the road; the others follow from learned depth"

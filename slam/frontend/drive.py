@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from slam.frames import Ends, RelativePose, SnippetPoses, TrackingEvent, View, runs
@@ -15,6 +15,7 @@ from slam.frontend.road import RoadStep, with_slope
 from slam.frontend.rotations import smooth_rotations
 from slam.frontend.visual.motion import Motion, Steps, triangulated
 from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import Failed
 
 logger = logging.getLogger(__name__)
 
@@ -180,6 +181,9 @@ def complete_drive(
     Raises:
         SlamError: no snippet was measured, so there is no motion to extrapolate.
     """
+    if measured.is_upside_down:
+        roads: list[float | Failed] = [Failed("the images are upside down")] * len(measured)
+        measured = replace(measured, roads=roads, road_steps={})
     ends = {*measured.steps, *map_poses.steps}
     cuts = find_cuts(measured.failures, ends, {*measured.unusable, *measured.repeated})
     filled = interpolate_gaps(measured, sources, cuts, map_poses)

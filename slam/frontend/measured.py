@@ -36,6 +36,8 @@ T = TypeVar("T")
 MAP_WIDTH_PX = 416  # of the depth that is fused: that of the networks
 _MOST_NAMED = 10  # stretches of frames in a sentence
 LAST_STEPS = 4  # in which the step to one of the last frames is looked up
+# least steps that tell, and their share: of upright vehicles 0.86 to 1 have nearer corners below
+_LEAST_VOTES, _UPSIDE_DOWN = 30, 1 / 3
 
 
 class FrontEnd(Enum):
@@ -98,6 +100,8 @@ class Measured:
         repeated: frames with the image of the one before.
         moving: those of them just before which the camera moved.
         fixed: the part of the last image that is fixed to the camera.
+        below_is_nearer: of each step, whether its corners below the axis are nearer than those above,
+            as over any ground.
 
     Known once the front end has finished:
         depth_error: of learned depth, as the steps have it.
@@ -118,6 +122,7 @@ class Measured:
     repeated: list[int] = field(default_factory=list)
     moving: list[int] = field(default_factory=list)
     fixed: Mask | None = None
+    below_is_nearer: list[bool] = field(default_factory=list)
     depth_error: DepthError = field(default_factory=DepthError)
     focal_length: FocalLength = field(default_factory=FocalLength)
     maps: Sequence[LocalMap] = ()
@@ -131,6 +136,14 @@ class Measured:
     def front_end(self) -> FrontEnd:
         """What measured the camera's motion: keyframes, where they have a map."""
         return FrontEnd.KEYFRAMES if self.maps else FrontEnd.STEPS
+
+    @property
+    def is_upside_down(self) -> bool:
+        """Whether the images show the world upside down, so that what looks like a road is the sky."""
+        votes = self.below_is_nearer
+        if self.maps or len(votes) < _LEAST_VOTES:  # a camera that is carried looks anywhere
+            return False
+        return sum(votes) < _UPSIDE_DOWN * len(votes)
 
     @property
     def steps(self) -> Steps:
@@ -163,7 +176,7 @@ class Measured:
         def renumbered(ends: Ends) -> Ends:
             return ends[0] - first, ends[1] - first
 
-        window = Measured(roads=self.roads[first:])
+        window = Measured(roads=self.roads[first:], below_is_nearer=self.below_is_nearer)
         for snippet in last(reversed(self.snippets), lambda snippet: min(snippet.sources)):
             target = snippet.target - first
             sources = tuple(source - first for source in snippet.sources)

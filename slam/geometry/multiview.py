@@ -156,17 +156,19 @@ def _best(
     def is_sure(pose: Resection) -> bool:
         return bool(_support(pose, votes) >= _DOUBTFUL_RATIO * votes.sum())
 
-    best = _refined(guesses[0], points, spread, pixels, K, votes)
+    def better(pose: Resection | None, T_camera_world: FloatArray) -> Resection:
+        other = _refined(T_camera_world, points, spread, pixels, K, votes)
+        return max(pose or other, other, key=lambda pose: _support(pose, votes))
+
+    best = better(None, guesses[0])
     for guess in guesses[1:]:
         if is_sure(best):
             break
-        other = _refined(guess, points, spread, pixels, K, votes)
-        best = max(best, other, key=lambda pose: _support(pose, votes))
+        best = better(best, guess)
     if not is_sure(best):
         start, inliers = consensus(points[votes], pixels[votes], K, _SAMPLES, INLIER_PX, seed)
         if len(inliers):
-            other = _refined(start, points, spread, pixels, K, votes)
-            best = max(best, other, key=lambda pose: _support(pose, votes))
+            best = better(best, start)
     return best
 
 

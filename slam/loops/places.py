@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from slam.frames import Intrinsics, View
 from slam.geometry.se3 import FloatArray, apply, invert
 from slam.loops.verification import LoopThresholds, matches
+from slam.loops.vocabulary import joined
 from slam.runtime.errors import RunError
 
 _FORMAT = 1
@@ -53,15 +54,9 @@ class Places:
             frames=np.array([view.index for view in self.views], np.int64),
             counts=np.array([len(view) for view in self.views], np.int64),
             T_world_camera=self.T_world_camera,
-            pixels=np.concatenate(
-                [np.zeros((0, 2), np.float32), *(view.pixels for view in self.views)]
-            ),
-            descriptors=np.concatenate(
-                [np.zeros((0, 32), np.uint8), *(view.descriptors for view in self.views)]
-            ),
-            points=np.concatenate(
-                [np.zeros((0, 3), np.float32), *(view.points for view in self.views)]
-            ),
+            pixels=joined(self.views, "pixels", 2, np.float32),
+            descriptors=joined(self.views, "descriptors", 32, np.uint8),
+            points=joined(self.views, "points", 3, np.float32),
         )
 
     @classmethod

@@ -8,6 +8,7 @@ images discriminate better.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +30,7 @@ class PlaceIndex:
 
     def __init__(self, views: Sequence[View]) -> None:
         """Train the vocabulary on the drive's views, at least one."""
-        everything = np.concatenate(
-            [np.zeros((0, 32), np.uint8), *(view.descriptors for view in views)]
-        )
+        everything = joined(views, "descriptors", 32, np.uint8)
         self._words = train_vocabulary(everything, _WORDS)
         counts = _word_counts(views, nearest_words(everything, self._words))
         seen_in = np.bincount(counts.indices, minlength=_WORDS)
@@ -47,6 +46,11 @@ class PlaceIndex:
         scores = (self.weights @ query.T).toarray().ravel()
         best = np.argsort(-scores, kind="stable")[:count]
         return [int(row) for row in best if scores[row] > 0]
+
+
+def joined(views: Sequence[View], name: str, columns: int, kind: type) -> NDArray[Any]:
+    """The rows ``(N, columns)`` of one array of all views."""
+    return np.concatenate([np.zeros((0, columns), kind), *(getattr(each, name) for each in views)])
 
 
 def train_vocabulary(descriptors: Descriptors, words: int) -> Descriptors:

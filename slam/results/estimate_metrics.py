@@ -130,17 +130,16 @@ def _motion(result: Estimate) -> records.MotionMetrics | Failed:
     window = min(_TOP_SPEED_S, span)
     begins = seconds[seconds <= seconds[-1] - window]
     ahead = np.interp(begins + window, seconds, path) - path[: len(begins)]
-    standing = [
-        each for each in result.drive.steps.values() if each.relative_pose.source == STILL_SOURCE
-    ]
-    steps = {each.ends for each in standing if each.ends[1] - each.ends[0] == 1}
+    drive = result.drive
+    stills = (
+        ends for ends, each in drive.steps.items() if each.relative_pose.source == STILL_SOURCE
+    )
+    steps = {ends for ends in stills if ends[1] - ends[0] == 1}
     return records.MotionMetrics.of(
         path=float(path[-1]),
         mean_speed=float(path[-1] / span),
         top_speed=float(ahead.max() / window),
-        standing_share=len(steps) / (len(path) - 1)
-        if result.drive.support is not None
-        else _BY_MAPS,
+        standing_share=len(steps) / (len(path) - 1) if drive.support is not None else _BY_MAPS,
     )
 
 

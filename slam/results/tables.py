@@ -93,7 +93,7 @@ def alignments_table(errors: TrajectoryMetrics, title: str = "") -> Table:
         f"{written(evo.rpe_rot_deg, 4)} deg; largest difference to ours {written(evo.difference, 1)}.",
         *(f"{DASH} {reason}." for reason in missing),
     ]
-    return Table(["alignment", *(each.header for each in statistics.values())], rows, title, notes)
+    return Table(["align", *(each.header for each in statistics.values())], rows, title, notes)
 
 
 def runs_table(runs: Sequence[tuple[Path, Metrics]]) -> Table:
@@ -149,14 +149,13 @@ def missing_notes(trajectories: Mapping[str, TrajectoryMetrics]) -> list[str]:
 
 def missing_errors(trajectories: Mapping[str, TrajectoryMetrics]) -> str:
     """Why no trajectory has an error; empty where one has, or where there is none."""
-    reasons = []
-    for column in COLUMNS:
-        for errors in trajectories.values():
-            value, reason = errors.at(column.path)
+    reason = ""
+    for errors in trajectories.values():
+        for value, why in (errors.at(column.path) for column in COLUMNS):
             if value is not None:
                 return ""
-            reasons.append(reason)
-    return reasons[0] if reasons else ""
+            reason = reason or why
+    return reason
 
 
 def _numbers(errors: TrajectoryMetrics) -> list[str]:

@@ -18,7 +18,8 @@ _FROM = {
 _WIDE_SPREAD = 0.15  # of the scale
 _LARGEST_SCALE_ERROR = 0.03
 _SURE = 0.5
-_NOISE_POINTS = 0.12  # share of factors off the promised one
+# per cent of the factors inside the bounds of their noise, and the share by which fewer are a doubt
+_LEVELS, _NOISE_POINTS = (50, 90, 95), 0.12
 _LEAST_FUSED = 0.15  # of the depth of all keyframes: maps of streets and rooms have 0.35 to 0.6
 
 
@@ -138,38 +139,20 @@ def _agreement(metrics: Metrics) -> Iterator[tuple[bool, str]]:
 
 
 def _noise(metrics: Metrics) -> Iterator[tuple[bool, str]]:
-    coverage = metrics.graph.coverage
-    shares = [
-        each
-        for each in (coverage.inside_50, coverage.inside_90, coverage.inside_95)
-        if each is not None
-    ]
-    if len(shares) == 3:
-        worst = max(
-            (share - promised for share, promised in zip(shares, (0.5, 0.9, 0.95))), key=abs
-        )
-        how = (
-            "holds"
-            if abs(worst) < _NOISE_POINTS
-            else "is too small"
-            if worst < 0
-            else "is too large"
-        )
+    shares = [metrics.at(f"graph.coverage.{level}")[0] for level in _LEVELS]
+    if None not in shares:
+        holds = all(share > level / 100 - _NOISE_POINTS for share, level in zip(shares, _LEVELS))
         told = ", ".join(f"{100 * share:.0f}" for share in shares)
         numbers = f"{told} % of its measurements lie inside their 50, 90, 95 % bounds"
-        yield how == "holds", f"its stated noise {how}: {numbers}"
+        yield holds, f"its stated noise {'holds' if holds else 'is too small'}: {numbers}"
 
 
 def _rest(metrics: Metrics) -> Iterator[tuple[bool, str]]:
     if doubled := sum(each.last - each.first + 1 for each in metrics.sequence.doubled or ()):
         yield False, f"{_count(doubled, 'frame')} repeat the one before while the camera moves"
     if (maps := metrics.tracking.maps or 1) > 1:
-        events = [
-            event
-            for event in metrics.tracking.events or ()
-            if event.frame and "begun" in event.event
-        ]
-        lost = ", ".join(str(event.frame) for event in events)
+        events = metrics.tracking.events or ()
+        lost = ", ".join(str(each.frame) for each in events if each.frame and "begun" in each.event)
         yield (
             False,
             f"tracking was lost{f' at frames {lost}' if lost else ''}: {maps} maps are not joined",

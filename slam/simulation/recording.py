@@ -45,11 +45,11 @@ class SimulatedSequence(RecordedSequence):
 
     is_rendered = True
 
-    def __init__(self, options: SimulationOptions, name: str = "sim") -> None:
+    def __init__(self, options: SimulationOptions) -> None:
         street = self.street = simulated_world(options)
         rendered = lru_cache(maxsize=_CACHED_FRAMES)(lambda index: street.render(index).image)
         super().__init__(
-            name,
+            "sim",
             ReadImages(
                 options.width,
                 options.height,

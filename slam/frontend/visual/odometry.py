@@ -72,7 +72,8 @@ _REPROJECTION_PX = 2.0  # largest reprojection error of a PnP inlier, pixels
 # largest deviation of a corner on the road from the camera's height, in camera heights
 _ROAD_TOLERANCE = 0.2
 _STILL_FLOW_PX = 0.3  # median optical flow below which the camera stands still, pixels
-_NEAR_SLOPE = 0.05  # of a ray below the axis; the ground there is within 20 camera heights
+# of a ray below the axis; the ground there is within 20 camera heights, and the sky above as far
+_NEAR_SLOPE = 0.05
 _LEAST_SHARED = 0.25  # of the near corners: what votes on them without those that passed by
 _MOST_STILL_FLOW_PX = 1.0  # of a corner of the world before a camera that stands still, pixels
 # least median optical flow that remains after rotation is removed, pixels: from the frame before, and
@@ -94,7 +95,8 @@ class VisualOdometry:
     """Measures ``T_previous_current`` between frames of one sequence, in the unscaled unit of depth.
 
     ``depth_error`` is that of learned depth and ``focal_length`` the one that corners show, by the
-    steps so far.
+    steps so far; ``below_is_nearer`` says of each whether corners below the axis are nearer than
+    those above.
     """
 
     def __init__(self, intrinsics: Intrinsics, seed: int = 0) -> None:
@@ -109,6 +111,7 @@ class VisualOdometry:
         self._seed = seed
         self._tracker = CornerTracker()
         self.depth_error, self.focal_length = DepthError(), FocalLength()
+        self.below_is_nearer: list[bool] = []
         self._dynamic_mask = DynamicMask.empty(intrinsics.width, intrinsics.height)
         self._history = MotionHistory()
         self._last: Motion | None = None  # to the last frame, where one was measured
@@ -318,6 +321,9 @@ class VisualOdometry:
         still = two_view.inliers & (matches.weights > 0.5)
         rays = matches.rays_previous[still], matches.rays_current[still]
         nearness, per_ray = triangulated_nearness(*rays, two_view.unit_pose)
+        above, below = (nearness[side * rays[0][:, 1] > _NEAR_SLOPE] for side in (-1, 1))
+        if min(len(above), len(below)) >= _MIN_RATIOS:
+            self.below_is_nearer.append(bool(np.median(below) > np.median(above)))
         sigma = two_view.noise_px / self._intrinsics.fx * per_ray
         self._dynamic_mask = self._dynamic_mask.updated(tracks.current, two_view.inliers)
         self._history = self._history.with_step(two_view.unit_pose, step.inlier_ratio, speed)

@@ -52,6 +52,7 @@ class StepTracker:
         self._road = RoadHomography(intrinsics)
         self._measured, self._seen = measured, seen
         self._apart: Apart | None = None
+        measured.below_is_nearer = self.odometry.below_is_nearer
 
     def add(self, recent: Sequence[Frame], current: Frame) -> list[Beside]:
         """Measure the step to a frame from the last ``recent`` one, and say what may be measured beside it.

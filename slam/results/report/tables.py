@@ -11,6 +11,7 @@ from markupsafe import Markup
 
 from erfsfm.common.table import Table
 from slam.evaluation.map import SurfaceMetrics
+from slam.frontend.measured import named
 from slam.results.metrics import CAMERA_HEIGHTS, METRES, Metrics, Stretch
 from slam.results.tables import motion_line, written
 from slam.runtime.files import MEANINGS, REPORT
@@ -25,6 +26,15 @@ _MAP_ERRORS = {
     "F-score\n0.2 m": "f_score.m02",
     "F-score\n0.5 m": "f_score.m05",
 }
+_ALIGN = "trajectories.optimised.align"
+# name, path in the metrics, decimals and unit; the last is of the map
+_TILES = (
+    ("Path", "sequence.length_m", 0, "m"),
+    ("Frames", "sequence.frames", 0, ""),
+    ("Processing", "timing.frames_per_second", 1, "frames/s"),
+    ("Loops accepted", "loops.accepted", 0, ""),
+    ("Map triangles", "map.triangles", 0, ""),
+)
 _TRUTHS = {
     "exact surface": "the exact surface of the simulated world",
     "depth maps": "depth maps accumulated at true poses",
@@ -39,19 +49,17 @@ def number(value: Any, decimals: int = 0) -> str:
 
 def key_numbers(metrics: Metrics, has_map: bool) -> list[tuple[str, str, str]]:
     """The key numbers that there are: name, value and unit of each; of the map where it is more than scraps."""
-    best = metrics.trajectories.optimised.align
-    error = (best.dof6, "m, 6 dof") if metrics.is_metric else (best.dof7, "m, 7 dof")
-    wanted = [
-        ("Position error", error[0].ate_rmse_m, 2, error[1]),
-        ("Drift, t_rel", best.dof7.t_rel_percent, 2, "%"),
-        ("Path", metrics.sequence.length_m, 0, "m"),
-        ("Frames", metrics.sequence.frames, 0, ""),
-        ("Processing", metrics.timing.frames_per_second, 1, "frames/s"),
-        ("Loops accepted", metrics.loops.accepted, 0, ""),
-        ("Map triangles", metrics.map.triangles if has_map else None, 0, ""),
+    dof = 6 if metrics.is_metric else 7
+    tiles = [
+        ("Position error", f"{_ALIGN}.{dof}dof.ate_rmse_m", 2, f"m, {dof} dof"),
+        ("Drift, t_rel", f"{_ALIGN}.7dof.t_rel_percent", 2, "%"),
+        *_TILES[: None if has_map else -1],
     ]
-    known = (tile for tile in wanted if tile[1] is not None)
-    return [(name, number(value, decimals), unit) for name, value, decimals, unit in known]
+    found = []
+    for name, path, decimals, unit in tiles:
+        if (value := metrics.at(path)[0]) is not None:
+            found.append((name, number(value, decimals), unit))
+    return found
 
 
 def what_ran(metrics: Metrics) -> Table:
@@ -164,11 +172,10 @@ def _scale(metrics: Metrics) -> str:
 
 def by_reason(found: Iterable[Stretch]) -> list[str]:
     """For each reason the frames that it is about, such as ``frames 3, 7 to 9: reason``."""
-    frames: dict[str, list[str]] = {}
+    frames: dict[str, list[int]] = {}
     for each in found:
-        ends = str(each.first) if each.first == each.last else f"{each.first} to {each.last}"
-        frames.setdefault(each.reason, []).append(ends)
-    return [f"frames {_shortened(ends)}: {reason}" for reason, ends in frames.items()]
+        frames.setdefault(each.reason, []).extend(range(each.first, each.last + 1))
+    return [f"frames {named(numbers)}: {reason}" for reason, numbers in frames.items()]
 
 
 def _shortened(names: Sequence[str]) -> str:

@@ -138,6 +138,20 @@ def test_image_folder(tmp_path: Path, inside: str) -> None:
     assert recording.image(1, 16, 24).shape == (16, 24, 3)
 
 
+def test_a_camera_that_is_given_comes_before_the_one_beside_the_images(tmp_path: Path) -> None:
+    """Of several drives under one root, without a camera of their own, too."""
+    file = write_camera(tmp_path / "calibration", fx=50.0, fy=50.0) / "camera.yaml"
+    write_images(write_camera(tmp_path / "root/first"))
+    write_images(tmp_path / "root/second/images")
+    (tmp_path / "root/third").mkdir()
+    write_video(tmp_path / "root/third/drive.avi")
+    found = discover(tmp_path / "root", file)
+    assert [each.name for each in found] == ["folder/first", "folder/second", "folder/third"]
+    assert {each.camera.fx for each in found} == {50.0}
+    with pytest.raises(DataError, match=r"none\.yaml is not there"):
+        discover(tmp_path / "root", tmp_path / "none.yaml")
+
+
 def write_video(path: Path, frames: int = 4) -> None:
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (48, 32))
     for index in range(frames):

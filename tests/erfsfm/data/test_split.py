@@ -30,6 +30,8 @@ def test_test_sequences_are_never_trained_on(kitti: Path) -> None:
 def test_a_misspelt_kind_is_not_left_in_the_training(kitti: Path) -> None:
     with pytest.raises(DataError, match=r"data\.exclude names 'simulatd/3'"):
         split_recordings(DataConfig(roots=[kitti], exclude=["simulatd/3"]))
+    with pytest.raises(DataError, match=r"--camera own\.yaml is for images and videos of your own"):
+        split_recordings(DataConfig(roots=[kitti]), Path("own.yaml"))
 
 
 def test_ranges_and_parts_that_are_excluded(kitti: Path) -> None:

@@ -24,7 +24,7 @@ from erfsfm.common.readers.camera_file import CAMERA_FILE, UNKNOWN_FX_SIGMA, rea
 from erfsfm.common.signals import Terminated
 from slam import run_slam
 from slam.commands.cli import main
-from slam.commands.run import FolderRecorder
+from slam.commands.run import FolderRecorder, RunOptions, RunRequest
 from slam.pipeline.observer import Observer
 from slam.pipeline.run import SlamPipeline
 from slam.results.folder import RunFolder
@@ -269,9 +269,13 @@ def test_images_without_a_camera_leave_one_for_the_next_run(
     assert read_camera_file(again.path / CAMERA_FILE) == camera
 
 
-def test_an_unknown_argument_is_named() -> None:
-    with pytest.raises(TypeError, match="sped"):
-        run_slam(**{"sped": 3})  # type: ignore[misc]
+def test_arguments_are_those_of_a_request_one_by_one() -> None:
+    """So that an editor and mypy know them."""
+    assert RunOptions.__annotations__.keys() == RunRequest.model_fields.keys() - {
+        "command",
+        "dataset",
+        "sequence",
+    }
 
 
 @pytest.mark.parametrize(

@@ -99,6 +99,7 @@ def driven(
     aside: int = 0,
     weak: int = 0,
     focal_sigma: float = 0.0,
+    turned: int = 0,
 ) -> float:
     """The confidence of a drive by its images."""
     poses = [RelativePose(k, k + 1, T, np.full(6, 0.01), "essential") for k, T in enumerate(STEPS)]
@@ -107,7 +108,9 @@ def driven(
         steps[pose.ends] = Motion(pose, 1e-4 * np.eye(6), support=0.1 if k < weak else support)
     drive = Drive(
         Measured(
-            roads=[Failed("not asked")] * (FRAMES + 1), focal_length=FocalLength(1e6, -1e6 * focal)
+            roads=[Failed("not asked")] * (FRAMES + 1),
+            focal_length=FocalLength(1e6, -1e6 * focal),
+            below_is_nearer=[k >= turned for k in range(FRAMES)],
         ),
         steps=steps,
         road_steps=dict.fromkeys([pose.ends for pose in poses[:on_road]]),
@@ -136,6 +139,7 @@ def driven(
         {"aside": 8},
         {"weak": 10},
         {"focal_sigma": 0.1},
+        {"turned": 35},
     ],
     ids=str,
 )

@@ -190,6 +190,22 @@ def test_frozen_frames_cost_no_more_than_black_ones() -> None:
     assert ate(run_on(repeated_as_jpeg)[0]) < 2 * ate(run_on(black)[0])
 
 
+def test_no_road_is_measured_in_the_sky() -> None:
+    """Of images that are upside down."""
+
+    def turned(sequence: SimulatedSequence, index: int) -> Frame:
+        frame = sequence.frame(index)
+        return replace(frame, image=np.ascontiguousarray(frame.image[::-1, ::-1]))
+
+    config = config_with("mapping.enabled=false")
+    drive = Damaged(street(), turned, range(FRAMES))
+    found = SlamPipeline(drive, oracle_of(drive), config).run()
+    assert (found.drive.measured.is_upside_down, len(found.drive.road_steps)) == (True, 0)
+    assert not found.scale.is_metric and isinstance(found.confidence, Failed)
+    assert any("180 degrees" in each.figure for each in found.agreements)
+    assert not run_on(black)[0].drive.measured.is_upside_down
+
+
 def test_doubled_frames_are_counted_and_cost_nothing() -> None:
     """Two frames come twice; the drive goes on where it was."""
     rows = sorted([*range(FRAMES - 2), 12, 25])

@@ -1,13 +1,11 @@
 import pickle
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 import pytest
 import room
 from oracle import OraclePredictor
 
-from erfsfm.common.processes import opencv_threads
 from slam import Slam
 from slam.config.sections import (
     KeyframesConfig,
@@ -138,22 +136,6 @@ def test_depth_is_predicted_for_keyframes_alone(interrupted: tuple[int, ...]) ->
     ]
     assert [snippet.target for snippet in drive.trusted if snippet.target > 18] == [22, 26, 30, 34]
     assert len(drive.trusted[0].sources) == 4 and not drive.interpolated
-
-
-@pytest.mark.parametrize("camera_height_m", [None, 1.65])
-def test_opencv_takes_all_cores_for_keyframes_alone(
-    camera_height_m: float | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A known height is that of a vehicle, whose networks need a core of their own."""
-    monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    truth = room.walk(2)
-    oracle, config = OraclePredictor(truth, lambda k: room.depth_map(truth[k])), SlamConfig()
-    with opencv_threads(1):
-        with Observer(
-            oracle, room.INTRINSICS, config, Stopwatch(), camera_height_m=camera_height_m
-        ):
-            assert cv2.getNumThreads() == (3 if camera_height_m is None else 1)
-        assert cv2.getNumThreads() == 1
 
 
 def test_observations_stay_while_frames_follow() -> None:

@@ -338,28 +338,6 @@ def motion(ends: Ends, metres: float, unit: float, ratio: float, seconds: float 
     )
 
 
-def test_evidence_has_a_row_a_link_also_where_steps_skip_frames() -> None:
-    """Frames a metre apart, a step over three frames between steps of one, and learned depth that drifts."""
-    links = [(0, 1), (1, 2), (2, 5), (5, 6), (6, 7), (7, 8)]
-    ratio = {(2, 5): 3.0, (5, 6): 1.0 / 3.0}
-    motions = {
-        ends: motion(ends, float(ends[1] - ends[0]), 0.1, ratio.get(ends, 1.0))
-        for ends in links
-        if ends != (6, 7)
-    }
-    absolute = {(2, 5): (3.1, 0.05), (5, 6): (1.2, 0.06), (6, 7): (9.0, 0.06), (3, 4): (1.0, 0.06)}
-    unit = np.linspace(10.0, 20.0, 9)
-    evidence = gather_evidence(links, motions, absolute, unit)
-    nan = np.nan
-    expected = np.log([nan, 1.0, 3.0, 1.0 / 3.0, nan, nan])
-    np.testing.assert_allclose(evidence.ratio, expected, atol=1e-9)
-    np.testing.assert_array_equal(evidence.ratio_sigma, [nan, 0.01, 0.01, 0.01, nan, nan])
-    lengths = np.array([1.0, 1.0, 3.0, 1.0, nan, 1.0])
-    np.testing.assert_allclose(evidence.learned, np.log(0.1 * lengths * unit[[0, 1, 2, 5, 6, 7]]))
-    np.testing.assert_allclose(evidence.absolute, np.log([nan, nan, 3.1, 1.2, nan, nan]))
-    np.testing.assert_allclose(evidence.absolute_sigma, [nan, nan, 0.05, 0.06, nan, nan])
-
-
 def test_sigmas_are_those_of_the_whole_system() -> None:
     """The chains of Schur complements give the same as inverting the whole matrix."""
     rng = np.random.default_rng(0)

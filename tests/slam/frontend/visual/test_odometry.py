@@ -15,6 +15,7 @@ from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import TriangulatedPoints, VisualOdometry
 from slam.geometry import se3
 from slam.runtime.errors import Failed
+from slam.sequences.catalogue import open_sequence
 
 CAMERA = Intrinsics(620, 188, 360.0, 360.0, 303.0, 92.0)
 UNIT = 0.3  # unscaled lengths per metre
@@ -334,26 +335,14 @@ def test_two_seeds_give_other_ransac_draws_and_one_seed_the_same(
     [("05", 90, 115, False, 0.5), pytest.param("00", 100, 145, True, 1.5, marks=pytest.mark.slow)],
 )
 def test_rotation_on_real_frames(data_root, name, first, last, block, largest_deg):
-    folder = data_root / "kitti_odometry" / "sequences" / name
-    P0 = np.array((folder / "calib.txt").read_text().splitlines()[0].split()[1:], float).reshape(
-        3, 4
-    )
-    rows = np.loadtxt(data_root / "kitti_odometry" / "poses" / f"{name}.txt").reshape(-1, 3, 4)
-    T_world_camera = se3.make(rows[:, :, :3], rows[:, :, 3])
-    frames = []
-    for k in range(first, last):
-        grey = cv2.imread(str(folder / "image_0" / f"{k:06d}.jpg"), cv2.IMREAD_GRAYSCALE)
-        frame = Frame(k, 0.1 * k, np.repeat(grey[..., None], 3, axis=2))
-        frames.append(
-            behind_block(frame, 24 * (k + 1 - first) - round(0.6 * grey.shape[1]))
-            if block
-            else frame
-        )
-    height, width = frames[0].image.shape[:2]
-    intrinsics = Intrinsics(width, height, P0[0, 0], P0[1, 1], P0[0, 2], P0[1, 2])
-    odometry = VisualOdometry(intrinsics)
-    constant = np.full((height, width), 10.0, np.float32)
-    rotations_deg = []
+    sequence = open_sequence(data_root / "kitti_odometry", name, frames=f"{first}:{last}")
+    camera, T_world_camera = sequence.intrinsics, sequence.reference
+    frames = [sequence.frame(k) for k in range(len(sequence))]
+    if block:
+        places = [24 * (k + 1) - round(0.6 * camera.width) for k in range(len(frames))]
+        frames = list(map(behind_block, frames, places))
+    odometry, rotations_deg = VisualOdometry(camera), []
+    constant = np.full((camera.height, camera.width), 10.0, np.float32)
     for previous, current in itertools.pairwise(frames):
         measured = pose_of(odometry.measure(previous, current, constant))
         T_previous_current = (

@@ -136,7 +136,7 @@ class DriveLabels:
                 for index in range(len(recording)):
                     cv2.imwrite(
                         str(drive / f"{index:06d}.png"),
-                        frames.read(recording.start + index)[..., ::-1],
+                        frames.read(recording.number(index))[..., ::-1],
                     )
             camera = asdict(recording.camera) | {"fps": _FPS, "camera_height_m": _CAMERA_HEIGHT_M}
             (drive / "camera.yaml").write_text(yaml.safe_dump(camera))

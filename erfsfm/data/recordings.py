@@ -73,7 +73,8 @@ class Recording:
     folder in an odometry root, ``oxts`` the folder of the GPS/IMU's packets, one a frame. For a part of a recording
     with gaps, ``skipped`` images come before it and there are ``stored`` in all; pose files may have rows for these
     alone. Of one in a prepared folder, ``labels`` is where the teacher's measurements are, and ``without_stops`` says
-    that frames in which the car stands still were taken out before.
+    that frames in which the car stands still were taken out before. The frames are every ``stride``-th one from
+    ``start``.
     """
 
     name: str
@@ -91,6 +92,7 @@ class Recording:
     skipped: int = 0
     stored: int = 0
     without_stops: bool = False
+    stride: int = 1
     labels: Path | None = None
 
     def __len__(self) -> int:
@@ -99,7 +101,15 @@ class Recording:
     @property
     def frames_name(self) -> str:
         """The name with its frames, as the leak record writes it: ``kitti_odometry/00[0:250]``."""
-        return f"{self.name}[{self.start}:{self.start + len(self)}]"
+        return f"{self.name}[{self.start}:{self.number(len(self))}]"
+
+    def number(self, index: int) -> int:
+        """The number that a frame has in the stored recording."""
+        return self.start + self.stride * index
+
+    def every(self, n: int) -> Recording:
+        """Every n-th frame, without what is known of them."""
+        return replace(self, images=self.images[::n], depth=None, stride=n * self.stride)
 
     @property
     def key(self) -> tuple[str, Path]:
@@ -112,7 +122,7 @@ class Recording:
             self,
             images=self.images[start:stop],
             depth=self.depth[start:stop] if self.depth else None,
-            start=self.start + start,
+            start=self.number(start),
             skipped=self.skipped + start,
         )
 
@@ -126,7 +136,7 @@ class Recording:
         stored = self.images[index]
         if self.video is not None:
             self._require_size(stored, self.video.height, self.video.width)
-            return self.video.image(self.start + index, height, width)
+            return self.video.image(self.number(index), height, width)
         image = read_image(stored)
         self._require_size(stored, *image.shape[:2])
         return resize_image(image, height, width)

@@ -303,6 +303,22 @@ def _require_begun(found: Sequence[Recording], ranges: Sequence[FrameRange]) -> 
             raise DataError(f"{frames} begins after the {end} frames that the recording has")
 
 
+def _moving(recording: Recording) -> list[Recording]:
+    """The stretches of an own recording in which the camera moves, every n-th frame where it moves little in one.
+
+    A doubled frame is no stop, and its drive stays whole for the teacher.
+    """
+    thinned, parts = recording, list[Recording]()
+    while not parts and (thinned is recording or len(thinned) > _SHORTEST_STOP):
+        shortest = min(_SHORTEST_END, len(thinned))
+        found = moving_parts(thinned, _SHORTEST_STOP)
+        parts = [part for part in found if len(part) >= shortest]
+        thinned = thinned.every(2)
+    if parts and (n := parts[0].stride) > 1:
+        logger.warning("%s: the camera moves little; every %d-th frame is taken", recording.name, n)
+    return parts
+
+
 def _without_stops(recordings: list[Recording]) -> list[Recording]:
     """The stretches of KITTI raw drives and of own recordings in which the camera moves; others as they are."""
     kept: list[Recording] = []
@@ -312,11 +328,8 @@ def _without_stops(recordings: list[Recording]) -> list[Recording]:
             kept.append(recording)
         elif kind == "kitti_raw":
             kept += moving_parts(recording)
-        else:  # a doubled frame of an own video is no stop, and its drive stays whole for the teacher
-            shortest = min(_SHORTEST_END, len(recording))
-            kept += [
-                part for part in moving_parts(recording, _SHORTEST_STOP) if len(part) >= shortest
-            ]
+        else:
+            kept += _moving(recording)
     before = sum(map(len, recordings))
     if (lost := before - sum(map(len, kept))) > 0:
         logger.info("left out %d of %d frames in which the camera stands still", lost, before)

@@ -148,8 +148,6 @@ def test_a_camera_that_is_given_comes_before_the_one_beside_the_images(tmp_path:
     found = discover(tmp_path / "root", file)
     assert [each.name for each in found] == ["folder/first", "folder/second", "folder/third"]
     assert {each.camera.fx for each in found} == {50.0}
-    with pytest.raises(DataError, match=r"none\.yaml is not there"):
-        discover(tmp_path / "root", tmp_path / "none.yaml")
 
 
 def write_video(path: Path, frames: int = 4) -> None:

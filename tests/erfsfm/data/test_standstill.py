@@ -16,6 +16,7 @@ from erfsfm.data.recordings import Recording
 from erfsfm.data.split import split_recordings
 from erfsfm.data.standstill import moving_parts
 
+CAMERA = "width: 208\nheight: 64\nfx: 150\nfy: 150\ncx: 104\ncy: 32\nfps: 10\n"
 WriteDrive = Callable[..., Path]
 
 
@@ -103,6 +104,18 @@ def test_real_recordings_never_stand_still(data_root: Path) -> None:
     assert spans(blind) == [(0, 40)]
 
 
+def test_of_a_camera_that_moves_little_every_nth_frame_is_taken(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    picture = street(0, 0, 0, np.random.default_rng(2))
+    for index in range(120):
+        shift = np.array([[1.0, 0.0, 0.03 * index], [0.0, 1.0, 0.0]])
+        cv2.imwrite(str(tmp_path / f"{index:06d}.png"), cv2.warpAffine(picture, shift, (208, 64)))
+    (tmp_path / "camera.yaml").write_text(CAMERA)
+    ((part,), _) = split_recordings(DataConfig(roots=[tmp_path], validation=[]))
+    assert f"every {part.stride}-th frame is taken" in caplog.text and part.number(len(part)) == 120
+
+
 @pytest.mark.parametrize(("standing", "expected"), [(3, [(0, 60)]), (14, [(0, 20), (34, 60)])])
 def test_a_doubled_frame_of_an_own_recording_is_no_stop(
     tmp_path: Path, standing: int, expected: list[tuple[int, int]]
@@ -113,8 +126,6 @@ def test_a_doubled_frame_of_an_own_recording_is_no_stop(
     for index in range(60):
         shift = 4 * (index if index < 20 else max(19, index - standing))
         cv2.imwrite(str(folder / "images" / f"{index:06d}.png"), street(shift, 0, 0, rng))
-    (folder / "camera.yaml").write_text(
-        "width: 208\nheight: 64\nfx: 150\nfy: 150\ncx: 104\ncy: 32\nfps: 10\n"
-    )
+    (folder / "camera.yaml").write_text(CAMERA)
     training, _ = split_recordings(DataConfig(roots=[folder], validation=[]))
     assert [(part.start, part.start + len(part)) for part in training] == expected

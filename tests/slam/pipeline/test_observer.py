@@ -201,7 +201,6 @@ def test_no_road_is_measured_in_the_sky() -> None:
     drive = Damaged(street(), turned, range(FRAMES))
     found = SlamPipeline(drive, oracle_of(drive), config).run()
     assert (found.drive.measured.is_upside_down, len(found.drive.road_steps)) == (True, 0)
-    assert not found.scale.is_metric and isinstance(found.confidence, Failed)
     assert any("180 degrees" in each.figure for each in found.agreements)
     assert not run_on(black)[0].drive.measured.is_upside_down
 

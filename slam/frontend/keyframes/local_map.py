@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Descriptors, Grey, Intrinsics, RelativePose, View, nearest_depth
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Sightings
+from slam.frontend.keyframes.image_turn import turned
 from slam.frontend.tracking import KEYFRAME_SEARCH, Pixels, are_inside, track
 from slam.geometry.multiview import PIXEL_SIGMA
 from slam.geometry.robust import weighted_median
@@ -385,17 +386,17 @@ class NewImage:
         self, keyframe: TrackedKeyframe, rows: NDArray[np.intp], guesses: Pixels
     ) -> tuple[Pixels, NDArray[np.bool_]]:
         """Some corners of a keyframe from guesses ``(M, 2)``, and which were found ``(M,)``."""
-        turned, pixels = self._as_turned(keyframe)
-        matched, kept = track(turned, self._grey, pixels[rows], _MATCHED, guesses)
+        image, pixels = self._as_turned(keyframe)
+        matched, kept = track(image, self._grey, pixels[rows], _MATCHED, guesses)
         return matched, kept & are_inside(matched, self._grey.shape)
 
     def flowed(self, keyframe: TrackedKeyframe) -> tuple[TrackIds, Pixels]:
-        """Corners of the last keyframe by dense optical flow, where steps are too large for that of corners."""
-        turned, pixels = self._as_turned(keyframe)
+        """Corners of a keyframe by dense optical flow, where steps are too large for that of corners."""
+        image, pixels = self._as_turned(keyframe)
         flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         unknown = np.zeros((0, 0), np.float32)
-        there = flow.calc(turned, self._grey, unknown)
-        back = flow.calc(self._grey, turned, unknown)
+        there = flow.calc(image, self._grey, unknown)
+        back = flow.calc(self._grey, image, unknown)
         rows = np.flatnonzero(are_inside(pixels, self._grey.shape))
         flowed = pixels[rows] + _at(there, pixels[rows])
         kept = are_inside(flowed, self._grey.shape)
@@ -411,15 +412,13 @@ class NewImage:
     def _as_turned(self, keyframe: TrackedKeyframe) -> tuple[Grey, Pixels]:
         """The image, which is kept, of a keyframe as the new camera is turned, and its corners ``(M, 2)`` there."""
         assert keyframe.grey is not None
-        K = self.intrinsics.K
-        H = K @ (self.T_camera_world[:3, :3] @ keyframe.T_camera_world[:3, :3].T) @ np.linalg.inv(K)
+        R, K = self.T_camera_world[:3, :3] @ keyframe.T_camera_world[:3, :3].T, self.intrinsics.K
         if keyframe.index not in self._turned:
             size = self.intrinsics.width, self.intrinsics.height
-            turned = cv2.warpPerspective(keyframe.grey, H, size, borderMode=cv2.BORDER_REPLICATE)
-            self._turned[keyframe.index] = np.asarray(turned, np.uint8)
-        moved = np.column_stack([keyframe.places, np.ones(len(keyframe.places))]) @ H.T
-        pixels = (moved[:, :2] / moved[:, 2:]).astype(np.float32)
-        return self._turned[keyframe.index], pixels
+            H = K @ R @ np.linalg.inv(K)
+            image = cv2.warpPerspective(keyframe.grey, H, size, borderMode=cv2.BORDER_REPLICATE)
+            self._turned[keyframe.index] = np.asarray(image, np.uint8)
+        return self._turned[keyframe.index], turned(keyframe.places, R, self.intrinsics)
 
 
 def _at(flow: NDArray[np.float32], pixels: Pixels) -> Pixels:

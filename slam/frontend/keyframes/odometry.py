@@ -173,7 +173,9 @@ class KeyframeOdometry:
         self._T_last_step = make(turn.R_now_before, np.zeros(3))
         T_turned = compose(self._T_last_step, self._T_camera_world)
         image = NewImage(frame.grey, T_turned, self._intrinsics)
-        if self._locate(segment, frame, *image.flowed(segment.keyframes[-1]), is_doubtful=True):
+        track_ids, pixels = image.flowed(segment.keyframes[-1])
+        seen = ~frame.is_fixed(pixels)
+        if self._locate(segment, frame, track_ids[seen], pixels[seen], is_doubtful=True):
             return
         if turn.correlation > _SURE_CORRELATION and not self._lost:
             self._T_camera_world = T_turned

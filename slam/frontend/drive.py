@@ -92,11 +92,12 @@ class Drive:
     Collected frame by frame, each list and dictionary growing at its end:
         ``motions`` are all steps that image geometry measured, ``road_steps`` the lengths by the
         road's homography, ``relative_rotations`` the rotations across several steps; ``failures``
-        are unmeasured steps with the reason. ``roads`` has one entry a frame, the camera's height
-        over the ground plane. ``unusable`` are frames without a measurement, with the reason,
-        ``repeated`` frames with the image of the one before, ``moving`` those of them just before
-        which the camera moved. ``depth_error`` is that of learned depth and ``focal_length`` the
-        one that corners show, as the steps have them. ``maps`` are those of keyframes and
+        are unmeasured steps with the share of corners that were found again. ``roads`` has one
+        entry a frame, the camera's height over the ground plane. ``unusable`` are frames without a
+        measurement, with the reason, ``repeated`` frames with the image of the one before,
+        ``moving`` those of them just before which the camera moved.
+        ``depth_error`` is that of learned depth and ``focal_length`` the one that corners show, as
+        the steps have them. ``maps`` are those of keyframes and
         ``events`` what became of them; a drive measured by steps alone has none. ``fixed`` is the
         part of the last image that is fixed to the camera.
 
@@ -112,7 +113,7 @@ class Drive:
     motions: list[Motion] = field(default_factory=list)
     road_steps: dict[Ends, RoadStep] = field(default_factory=dict)
     relative_rotations: list[RelativeRotation] = field(default_factory=list)
-    failures: list[tuple[int, int, str]] = field(default_factory=list)
+    failures: list[tuple[int, int, float]] = field(default_factory=list)
     roads: list[float | Failed] = field(default_factory=list)
     views: list[View] = field(default_factory=list)
     keyframes: list[Keyframe] = field(default_factory=list)
@@ -197,8 +198,8 @@ class Drive:
             window.road_steps[renumbered(ends)] = step
         for turn in last(reversed(self.relative_rotations), lambda turn: turn.ends[0]):
             window.relative_rotations.append(replace(turn, ends=renumbered(turn.ends)))
-        for earlier, later, why in last(reversed(self.failures), lambda failure: failure[0]):
-            window.failures.append((*renumbered((earlier, later)), why))
+        for earlier, later, found in last(reversed(self.failures), lambda failure: failure[0]):
+            window.failures.append((*renumbered((earlier, later)), found))
         for frame, why in last(reversed(self.unusable.items()), lambda item: item[0]):
             window.unusable[frame - first] = why
         for frame in last(reversed(self.repeated), lambda frame: frame):

@@ -393,13 +393,9 @@ class Observer:
         if isinstance(measured, Motion) and not is_se3(measured.relative_pose.T_from_to):
             measured = Failed(_NO_POSE)
         if isinstance(measured, Failed):
-            self.drive.failures.append((previous.frame.index, current.frame.index, measured.reason))
-            logger.info(
-                "geometry %d -> %d failed: %s",
-                previous.frame.index,
-                current.frame.index,
-                measured.reason,
-            )
+            ends = previous.frame.index, current.frame.index
+            self.drive.failures.append((*ends, self._odometry.found))
+            logger.info("geometry %d -> %d failed: %s", *ends, measured.reason)
             return None
         self.drive.motions.append(measured)
         return (first.frame, measured) if measured.is_triangulated else None

@@ -20,6 +20,8 @@ from slam.runtime.errors import Failed
 logger = logging.getLogger(__name__)
 
 DOUBLED = "the image repeats the one before while the camera moves"
+# of the corners: across a cut few are found again, by chance, before a lorry half of them
+_LEAST_FOUND = 0.2
 _LONGEST_GAP = 30  # interpolated frames, after which the place is only guessed
 
 
@@ -104,27 +106,26 @@ class Drive:
 
 
 def find_cuts(
-    failures: Sequence[tuple[int, int, str]], measured: Collection[Ends], doubtful: Collection[int]
+    failures: Sequence[tuple[int, int, float]],
+    measured: Collection[Ends],
+    doubtful: Collection[int],
 ) -> list[int]:
     """Frames that show another place than the frame before: their step failed, the steps before and after did not.
 
     Args:
-        failures: steps that image geometry could not measure, and why.
+        failures: steps that image geometry could not measure, and the share of corners that were
+            found again.
         measured: steps that it measured.
         doubtful: frames that are unusable or repeat the one before.
     """
     ends = set(measured)
-    crossed: set[int] = set()  # frames across whose beginning a longer step measures
-    for first, last in ends:
-        if last - first > 1:
-            crossed.update(range(first + 1, last + 1))
     cuts = []
-    for first, last, _ in failures:
+    for first, last, found in failures:
         around = {first - 1, first, last, last + 1}
-        alone = last == first + 1 and (first - 1, first) in ends and (last, last + 1) in ends
-        if alone and around.isdisjoint(doubtful) and last not in crossed:
+        alone = last == first + 1 and {(first - 1, first), (last, last + 1)} <= ends
+        if found < _LEAST_FOUND and alone and around.isdisjoint(doubtful):
             cuts.append(last)
-    return sorted(set(cuts))
+    return cuts
 
 
 def find_segments(

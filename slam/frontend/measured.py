@@ -92,7 +92,8 @@ class Measured:
         motions: all steps that image geometry measured.
         road_steps: lengths of steps by the road's homography.
         relative_rotations: rotations across several steps.
-        failures: steps that image geometry could not measure, with the reason.
+        failures: steps that image geometry could not measure, with the share of corners that were
+            found again.
         roads: of every frame, the camera's height over the ground plane.
         views: of frames among which loops are sought.
         keyframes: frames for the map.
@@ -114,7 +115,7 @@ class Measured:
     motions: list[Motion] = field(default_factory=list)
     road_steps: dict[Ends, RoadStep] = field(default_factory=dict)
     relative_rotations: list[RelativeRotation] = field(default_factory=list)
-    failures: list[tuple[int, int, str]] = field(default_factory=list)
+    failures: list[tuple[int, int, float]] = field(default_factory=list)
     roads: list[float | Failed] = field(default_factory=list)
     views: list[View] = field(default_factory=list)
     keyframes: list[Keyframe] = field(default_factory=list)
@@ -189,8 +190,8 @@ class Measured:
             window.road_steps[renumbered(ends)] = step
         for turn in last(reversed(self.relative_rotations), lambda turn: turn.ends[0]):
             window.relative_rotations.append(replace(turn, ends=renumbered(turn.ends)))
-        for earlier, later, why in last(reversed(self.failures), lambda failure: failure[0]):
-            window.failures.append((*renumbered((earlier, later)), why))
+        for earlier, later, found in last(reversed(self.failures), lambda failure: failure[0]):
+            window.failures.append((*renumbered((earlier, later)), found))
         for frame, why in last(reversed(self.unusable.items()), lambda item: item[0]):
             window.unusable[frame - first] = why
         for frame in last(reversed(self.repeated), lambda frame: frame):

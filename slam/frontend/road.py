@@ -40,7 +40,9 @@ _STEPS_KEPT = 100
 _SHAPES = (9.0, 1.0, 0.06), (4.5, 2.0, 0.1)
 _POINTS = 2500  # approximate number of aligned pixels
 _MIN_POINTS = 300  # least number of aligned pixels of a measurement
-_TILT_SIGMA_DEG = 0.07  # sigma of the ground plane's tilt against the direction of motion, degrees
+# sigma of the ground plane's tilt against the direction of motion, degrees, beside pixels that count as
+# independent, and the power of the hidden distance by which they count for more
+_TILT_SIGMA_DEG, _TRUST = 0.07, 4
 _MAX_TILT_DEG = 4.0  # largest tilt of the ground plane, degrees
 _MIN_CORRELATION = 0.3  # least correlation of the aligned pixels
 # least fraction of the photometric error without motion that the alignment removes
@@ -220,7 +222,9 @@ class RoadHomography:
             x, y, z = points
             slope = (slope_x * fx * (tx - x / z * tz) + slope_y * fy * (ty - y / z * tz)) / z
             sigma = max(mad_sigma(residual), 0.3)
-            weighted = strip.rays * (slope / (sigma**2 * (1.0 + (residual / (2.0 * sigma)) ** 2)))
+            # farther ground tells the tilt better beside what is expected of it
+            trust = strip.hidden**_TRUST / sigma**2
+            weighted = strip.rays * (slope * trust / (1.0 + (residual / (2.0 * sigma)) ** 2))
             information = ((weighted * slope) @ strip.rays.T).astype(np.float64)
             right = information @ plane - weighted @ residual
             last, plane = plane, _solved(information, right, expected, float(np.linalg.norm(plane)))
@@ -296,10 +300,12 @@ class _Strip:
 
     They lie on a grid; ``places`` are their rows and columns there, ``coverage`` ``(H, W)`` is the
     blurred mask of them, ``gradual`` the sigma of the blur, and ``relative_sigma`` that of step
-    lengths.
+    lengths. ``hidden`` is the distance of the nearest ground that is seen over that without what
+    is fixed to the camera.
     """
 
     relative_sigma: float
+    hidden: float
     rows: NDArray[np.int64]
     columns: NDArray[np.int64]
     rays: _Layer
@@ -323,13 +329,15 @@ def _strip(
     relative_sigma: float,
     visible: Mask,
 ) -> _Strip:
-    """The strip of a length and half width in camera heights."""
+    """The strip of a length and half width in camera heights; it reaches farther where a bonnet hides its beginning."""
     v, u = np.mgrid[top_row : intrinsics.height, : intrinsics.width]
     rays = intrinsics.rays(np.stack([u, v], axis=-1))
     depth_heights = 1.0 / np.maximum(rays[..., 1], 1e-6)
-    seen = (depth_heights < far) & (np.abs(rays[..., 0] * depth_heights) < half_width)
-    step = max(round(float(np.sqrt(seen.sum() / _POINTS))), 1)
-    seen &= visible
+    level = np.abs(rays[..., 0] * depth_heights) < half_width
+    ground = depth_heights[level]
+    step = max(round(float(np.sqrt((ground < far).sum() / _POINTS))), 1)
+    hidden = float(depth_heights[level & visible].min(initial=far) / ground.min(initial=far))
+    seen = level & visible & (depth_heights < hidden * far)
     rows, columns = np.nonzero(seen & (v % step == 0) & (u % step == 0))
     places = rows // step, columns // step
     mask = np.zeros((len(seen) // step + 1, intrinsics.width // step + 1), np.float32)
@@ -337,6 +345,7 @@ def _strip(
     gradual = _gradual_px(intrinsics) / step
     return _Strip(
         relative_sigma,
+        hidden,
         rows,
         columns,
         np.ascontiguousarray(rays[rows, columns].T, dtype=np.float32),

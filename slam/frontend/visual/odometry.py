@@ -96,7 +96,7 @@ class VisualOdometry:
 
     ``depth_error`` is that of learned depth and ``focal_length`` the one that corners show, by the
     steps so far; ``below_is_nearer`` says of each whether corners below the axis are nearer than
-    those above.
+    those above. ``found`` is the share of corners that the last measurement found again.
     """
 
     def __init__(self, intrinsics: Intrinsics, seed: int = 0) -> None:
@@ -114,6 +114,7 @@ class VisualOdometry:
         self.below_is_nearer: list[bool] = []
         self._dynamic_mask = DynamicMask.empty(intrinsics.width, intrinsics.height)
         self._history = MotionHistory()
+        self.found = 1.0
         self._last: Motion | None = None  # to the last frame, where one was measured
         # by the last motion that corners alone gave, and the frame where it ended
         self._points: tuple[int, TriangulatedPoints | None] = (-1, None)
@@ -147,6 +148,7 @@ class VisualOdometry:
                 last.relative_pose.T_from_to, depth_previous_unscaled, self._intrinsics
             )
         tracks = self._tracker.track(previous, current, flow)
+        self.found = len(tracks) / max(tracks.sought, 1)
         if len(tracks) < MIN_INLIERS:
             measured: Motion | Failed = Failed(f"only {len(tracks)} corners could be tracked")
         else:

@@ -71,9 +71,9 @@ class StepTracker:
         if isinstance(step, Motion) and not is_se3(step.relative_pose.T_from_to):
             step = Failed(NO_POSE)
         if isinstance(step, Failed):
-            failure = recent[-1].index, current.index, step.reason
-            self._measured.failures.append(failure)
-            logger.info("geometry %d -> %d failed: %s", *failure)
+            ends = recent[-1].index, current.index
+            self._measured.failures.append((*ends, self.odometry.found))
+            logger.info("geometry %d -> %d failed: %s", *ends, step.reason)
             return []
         self._measured.motions.append(step)
         if not step.is_triangulated:

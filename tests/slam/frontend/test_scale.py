@@ -229,17 +229,6 @@ def test_lengths_have_the_unit_that_was_measured(mode, road, unit):
     assert scale.in_metres(ScaleEstimate(2.0, 0.1, 9)).unit == "metres"
 
 
-def test_without_a_height_the_unit_is_the_camera_height():
-    roads = [0.5] * 9
-    assert scale_from_road(roads).value == pytest.approx(2.0)
-    assert scale_from_road(roads, 1.65).value == pytest.approx(3.3)
-
-
-def test_too_few_frames_give_no_scale():
-    failure = scale_from_road([*[0.5] * 3, *[Failed("dark")] * 30], 1.65)
-    assert isinstance(failure, Failed) and "only 3 frames" in failure.reason
-
-
 def test_the_scale_track_follows_a_drifting_unit_across_frames_without_a_plane():
     heights = np.where(np.arange(200) < 100, 0.50, 0.52)
     roads = heights.tolist()

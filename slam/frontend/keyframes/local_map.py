@@ -40,6 +40,9 @@ _PROJECTED_PX = 4.0
 _ALIGNED_KEYFRAMES = 4
 # of dense flow there and back, and by which that of corners may correct it
 _RETURNED_PX, _REFINED_PX = 2.0, 3.0
+_REPLICATED = cv2.BORDER_REPLICATE
+# of an image with the one that dense flow makes of it: 0.85 and more of one scene, of another to 0.66
+_LEAST_CORRELATION = 0.75
 # a point that two keyframes do not find is hidden; after three keyframes that find hardly any, so
 # are those that remain
 _ATTEMPTS, _MISSES = 2, 3
@@ -397,7 +400,10 @@ class NewImage:
         unknown = np.zeros((0, 0), np.float32)
         there = flow.calc(image, self._grey, unknown)
         back = flow.calc(self._grey, image, unknown)
-        rows = np.flatnonzero(are_inside(pixels, self._grey.shape))
+        x, y = np.moveaxis((self.intrinsics.pixel_grid() + there).astype(np.float32), -1, 0)
+        made = cv2.remap(self._grey, x, y, cv2.INTER_LINEAR, borderMode=_REPLICATED)
+        is_seen = cv2.matchTemplate(made, image, cv2.TM_CCOEFF_NORMED) > _LEAST_CORRELATION
+        rows = np.flatnonzero(are_inside(pixels, self._grey.shape) & is_seen[0])
         flowed = pixels[rows] + _at(there, pixels[rows])
         kept = are_inside(flowed, self._grey.shape)
         rows, flowed = rows[kept], flowed[kept]
@@ -416,7 +422,7 @@ class NewImage:
         if keyframe.index not in self._turned:
             size = self.intrinsics.width, self.intrinsics.height
             H = K @ R @ np.linalg.inv(K)
-            image = cv2.warpPerspective(keyframe.grey, H, size, borderMode=cv2.BORDER_REPLICATE)
+            image = cv2.warpPerspective(keyframe.grey, H, size, borderMode=_REPLICATED)
             self._turned[keyframe.index] = np.asarray(image, np.uint8)
         return self._turned[keyframe.index], turned(keyframe.places, R, self.intrinsics)
 

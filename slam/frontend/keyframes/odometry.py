@@ -63,8 +63,7 @@ _YOUNG_KEYFRAMES = 4
 _DOUBTFUL_PARALLAX_RATIO = 0.005
 _LOOKED_BACK = 4  # keyframes between which points have parallax before a first motion
 _MAX_CORNERS = 500  # of a keyframe
-# of inliers, below which corners are sought by dense flow, and below which that shows another scene
-_DOUBTFUL_RATIO, _LEAST_RATIO = 0.5, 0.3
+_DOUBTFUL_RATIO = 0.5  # of inliers, below which corners are sought by dense flow
 _NOTHING: tuple[TrackIds, Pixels] = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
 
 
@@ -249,8 +248,8 @@ class KeyframeOdometry:
         known = segment.known(track_ids)
         places, pixels = pixels, in_middle_row(pixels, self._turn_rate, self._intrinsics)
         pose = self._resected(segment, track_ids[known], pixels[known])
-        least = _LEAST_RATIO if is_doubtful else _DOUBTFUL_RATIO
-        if pose is None or len(pose.inliers) < least * known.sum():
+        least = 0.0 if is_doubtful else _DOUBTFUL_RATIO * known.sum()
+        if pose is None or len(pose.inliers) < least:
             return False
         self._lost = 0
         before, self._T_camera_world = self._T_camera_world, pose.T_camera_world

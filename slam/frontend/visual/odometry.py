@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +64,7 @@ STILL_SOURCE = "still"
 _MIN_RATIOS = 8
 _PNP_ITERATIONS = 200
 _LEAST_PNP_SHARE = 0.5  # of the corners: what fewer agree on is chance
+_LEAST_SUPPORT = 0.25  # of those that were sought: where kerbs repeat, the others are far ahead
 _LEARNED_RELATIVE_SIGMA = 0.1
 _LEARNED_LENGTH_RELATIVE_SIGMA = 0.05
 # least rotation sigma of a standing camera and of PnP
@@ -163,7 +164,13 @@ class VisualOdometry:
                 or self._by_essential((previous, current), tracks, votes, learned, height_unscaled)
                 or self._by_points(ends, tracks, votes, depth)
             )
-        self._last = measured if isinstance(measured, Motion) else None
+        if isinstance(measured, Motion):
+            self._last = measured
+        elif last is not None and flow is not None:  # the camera goes on as it went
+            pose = replace(last.relative_pose, from_index=previous.index, to_index=current.index)
+            self._last = replace(last, relative_pose=pose)
+        else:
+            self._last = None
         return measured
 
     def carried(self, depth_previous_unscaled: DepthMap, motion: Motion) -> DepthMap | None:
@@ -405,7 +412,7 @@ class VisualOdometry:
             points_previous, pixels, K, _PNP_ITERATIONS, _REPROJECTION_PX, self._seed
         )
         count = len(inliers)
-        if count < max(MIN_INLIERS, _LEAST_PNP_SHARE * len(pixels)):
+        if count < max(MIN_INLIERS, _LEAST_PNP_SHARE * len(pixels), _LEAST_SUPPORT * tracks.sought):
             known_corners = f"{count} of {len(pixels)} corners"
             return Failed(f"little parallax, and only {known_corners} agree with the learned depth")
         resection = resect([T_start], points_previous[inliers], pixels[inliers], K)

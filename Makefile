@@ -23,6 +23,7 @@ setup: $(READY)
 
 $(READY): pyproject.toml constraints.txt requirements.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and f"Python 3.11 or newer is wanted; $(PYTHON) is {sys.version.split()[0]}; set PYTHON=")'
+	@echo 'set-up, once: the libraries of requirements.lock into $(VENV), then torch, then this project (minutes)'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --require-hashes --no-deps --requirement requirements.lock
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) torch

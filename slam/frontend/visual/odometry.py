@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,6 +116,7 @@ class VisualOdometry:
         self._dynamic_mask = DynamicMask.empty(intrinsics.width, intrinsics.height)
         self._history = MotionHistory()
         self.found = 1.0
+        self._height: float | None = None  # the last one that was known
         self._last: Motion | None = None  # to the last frame, where one was measured
         # by the last motion that corners alone gave, and the frame where it ended
         self._points: tuple[int, TriangulatedPoints | None] = (-1, None)
@@ -164,13 +165,7 @@ class VisualOdometry:
                 or self._by_essential((previous, current), tracks, votes, learned, height_unscaled)
                 or self._by_points(ends, tracks, votes, depth)
             )
-        if isinstance(measured, Motion):
-            self._last = measured
-        elif last is not None and flow is not None:  # the camera goes on as it went
-            pose = replace(last.relative_pose, from_index=previous.index, to_index=current.index)
-            self._last = replace(last, relative_pose=pose)
-        else:
-            self._last = None
+        self._last = measured if isinstance(measured, Motion) else None
         return measured
 
     def carried(self, depth_previous_unscaled: DepthMap, motion: Motion) -> DepthMap | None:
@@ -319,7 +314,8 @@ class VisualOdometry:
                 *ends,
                 "as usual" if chosen is usual else "by corners alone",
             )
-        self._learn(tracks, matches, learned, chosen, chosen.speed(height, seconds))
+        self._height = height or self._height
+        self._learn(tracks, matches, learned, chosen, chosen.speed(self._height, seconds))
         return chosen.motion
 
     def _learn(

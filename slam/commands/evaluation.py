@@ -92,8 +92,11 @@ def of_two(
     else:
         tables.alignments_table(run.errors, f"{estimate.name} against {reference.name}").print()
         both = {estimate: "optimised", reference: REFERENCE}
+        # a run has each trajectory in both formats
+        timed = (read_trajectory(path, format).timed for path in both if path.is_file())
+        kind = "tum" if all(timed) else "kitti"
         files = [
-            path / trajectory_file(name, "kitti") if path.is_dir() else path
+            path / trajectory_file(name, kind) if path.is_dir() else path
             for path, name in both.items()
         ]
         typer.echo("\n".join(evo_commands(files[0], files[-1], format)))

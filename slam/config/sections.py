@@ -152,7 +152,7 @@ class GpsConfig(Section):
 
 
 class ScaleConfig(Section):
-    """Metric scale, see ``frontend/scale.py``."""
+    """Metric scale, see ``frontend/scale_mode.py``."""
 
     mode: Literal["auto", "none", "camera-height", "lidar", "reference", "known", "gps"] = Field(
         default="auto",

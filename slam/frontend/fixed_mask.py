@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 
 from slam.frames import Grey, Mask, shrunk, slopes_of
 
+logger = logging.getLogger(__name__)
+
 LEAST_IMAGES = 20  # before which nothing is said
 _REMEMBERED_IMAGES = 200  # a wiper comes to rest, a sticker falls
 _EVERY_FIRST, _EVERY = 2, 5  # image that is looked at, until there are enough, and then
@@ -50,14 +52,10 @@ _TOWARDS_MIDDLE = 0.5  # cosine of the angle between a gradient and the directio
 _NEAR_MIDDLE = 0.06  # of the width, within which every direction may be that of the motion
 _GAP = 0.025  # of the width, over which fixed edges are joined
 _DEEPEST = 0.4  # of the side of the image that such an edge may hide
+_LEAST_STANDING, _MOST_STANDING = 0.02, 0.6  # of the image, of which a run says something
 _MARGIN = np.ones((3, 3), np.uint8)  # corners beside a fixed pixel see a part of it
 
 _Layer = NDArray[np.float32]
-
-
-logger = logging.getLogger(__name__)
-
-_LEAST_STANDING, _MOST_STANDING = 0.02, 0.6  # of the image, of which a run says something
 
 
 class FixedMask:

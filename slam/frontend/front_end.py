@@ -61,7 +61,7 @@ class MotionTracker:
         self._config, self._intrinsics, self._camera_height_m = config, intrinsics, camera_height_m
         self._measured, self._stopwatch = measured, stopwatch
         self._steps = StepTracker(intrinsics, seed, measured, seen)
-        self.by_steps = self._steps.odometry  # knows the error of learned depth
+        self.step_odometry = self._steps.odometry  # knows the error of learned depth
         self._cores = ExitStack()
         # the networks, which predict little for keyframes, leave their core to optical flow
         self._cores.enter_context(opencv_threads(usable_cores()))
@@ -139,8 +139,9 @@ class MotionTracker:
         Maps are cut into parts of one unit each; there are none of a vehicle, nor before the choice.
         """
         self.choose()
-        measured, by_steps = self._measured.copy(), self.by_steps
-        measured.depth_error, measured.focal_length = by_steps.depth_error, by_steps.focal_length
+        measured = self._measured.copy()
+        measured.depth_error = self.step_odometry.depth_error
+        measured.focal_length = self.step_odometry.focal_length
         if self._keyframes is not None:
             measured.events = list(self._keyframes.events)
         parts: list[LocalMap] = []

@@ -61,10 +61,10 @@ def interpolate_gaps(
         why = next(iter(measured.unusable.values()), "the sequence is too short")
         raise SlamError(f"no {sources + 1} usable frames in a row among {count}: {why}")
     new = set(range(count)).difference(measured.unusable, measured.repeated)
-    raw = network_steps(measured.snippets)
-    calibration = calibrate_network(raw, _poses(measured.steps), np.ones(count))
+    raw, by_corners = network_steps(measured.snippets), measured.steps
+    calibration = calibrate_network(raw, _poses(by_corners), np.ones(count))
     by_network = calibration.scaled(raw)
-    frozen, steps = _without_frozen(by_network, measured.steps, map_poses, measured.repeated, new)
+    frozen, steps = _without_frozen(by_network, by_corners, map_poses, measured.repeated, new)
     why = "the image stands still while the camera moves"
     frames = measured.unusable | dict.fromkeys(frozen, why)
     trusted = [snippet for snippet in measured.snippets if _is_trusted(snippet, frozen, cuts)]

@@ -174,12 +174,9 @@ def find_scale(unit: Unit, drive: Drive, lidar_steps: Sequence[RelativePose] = (
         drive: completed.
         lidar_steps: steps by LiDAR, metres.
     """
-    motions, height_m = drive.triangulated, unit.stated_m
-    frames = len(drive)
-    if not unit.by_lidar:
-        lidar_steps = ()
-    elif (by_lidar := height_by_lidar(lidar_steps, drive)) is not None:
-        height_m = by_lidar
+    motions, frames = drive.triangulated, len(drive)
+    lidar_steps = lidar_steps if unit.by_lidar else ()
+    height_m = height_by_lidar(lidar_steps, drive) or unit.stated_m
     height = 1.0 if height_m is None else height_m
     absolute = _absolute_lengths(drive.road_steps, height, lidar_steps)
     by_planes = scale_from_road(drive.measured.roads, height)
@@ -196,7 +193,7 @@ def find_scale(unit: Unit, drive: Drive, lidar_steps: Sequence[RelativePose] = (
     misfit = np.abs(evidence.absolute - np.log(solved.length))
     used = int(np.isfinite(misfit).sum())
     estimate = by_planes
-    is_metric = height_m is not None or len(lidar_steps) > 0
+    is_metric = height_m is not None or bool(lidar_steps)
     named: LengthUnit = "metres" if is_metric else "camera heights"
     if used >= MIN_FRAMES:
         spread = mad_sigma(misfit[np.isfinite(misfit)])

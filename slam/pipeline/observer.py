@@ -304,7 +304,7 @@ class Observer:
 
     def _learn(self, current: FrameInWork, depth: DepthMap) -> None:
         """Everything that the depth ``(H, W)`` of a frame gives."""
-        frame, error = current.frame, self.tracker.by_steps.depth_error
+        frame, error = current.frame, self.tracker.step_odometry.depth_error
         if frame.fixed is not None:
             depth = np.where(resized_mask(frame.fixed, *depth.shape[::-1]), np.float32(0), depth)
         with self._stopwatch.stage("road"):
@@ -326,7 +326,7 @@ class Observer:
             recent.depth = self._carried(recent)
         if recent.depth is None:
             recent.depth = self._predict(frame).result()
-            road = self._plane.fit(recent.depth, self.tracker.by_steps.depth_error)
+            road = self._plane.fit(recent.depth, self.tracker.step_odometry.depth_error)
             recent.height = None if isinstance(road, Failed) else road
         return frame, recent.depth, recent.height
 
@@ -338,7 +338,7 @@ class Observer:
         before = next((each for each in self._recent if each.frame.index == step.ends[0]), None)
         if before is None or before.depth is None:
             return None
-        depth, recent.height = self.tracker.by_steps.carried(before.depth, step), before.height
+        depth, recent.height = self.tracker.step_odometry.carried(before.depth, step), before.height
         if depth is not None:
             self._keep_for_map(recent.frame, depth)
         return depth

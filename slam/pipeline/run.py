@@ -193,7 +193,7 @@ class SlamPipeline:
         )
 
     def fuse(self, estimate: Estimate, recorder: Recorder) -> TsdfMap | None:
-        """The map, as `fusion.fuse`; None where mapping is switched off, or no frame has depth."""
+        """The map, as `slam.pipeline.estimate.fuse`; None where mapping is switched off, or no frame has depth."""
         if not self._config.mapping.enabled or not estimate.drive.keyframes:
             return None
         camera, progress = self.sequence.intrinsics, self._progress

@@ -275,10 +275,8 @@ def _tracking(result: Estimate) -> records.TrackingMetrics | Failed:
 
 def _depth_error(result: Estimate) -> list[dict[str, float | None]] | Failed:
     """Bias and sigma of learned depth over distance at the end of the drive, in the unit of the trajectory."""
-    curve, unit = (
-        result.drive.measured.depth_error.curve(),
-        float(np.median(result.scale.per_frame)),
-    )
+    curve = result.drive.measured.depth_error.curve()
+    unit = float(np.median(result.scale.per_frame))
     if not curve:
         return Failed("no step triangulated corners with learned depth")
     return [

@@ -133,8 +133,6 @@ def test_a_given_scale_and_clipping_by_hand() -> None:
     truth, guess = np.array([[10.0, 60.0]], np.float32), np.array([[3.0, 100.0]], np.float32)
     before = depth_errors(guess, truth, scaling=2.0, clipping="before")
     after = depth_errors(guess, truth, scaling=2.0)
-    assert before is not None
-    assert after is not None
     assert before.abs_rel == pytest.approx((0.4 + 100 / 60) / 2), (
         "80 doubled, and not clipped again"
     )

@@ -164,15 +164,8 @@ def test_receptive_field(
 ) -> None:
     images = write_root(tmp_path / "root", frames=6) / "sequences/00/image_2"
     picture = tmp_path / "new/field.png"
-    options = [
-        "--network",
-        "erf-posenet-dilated",
-        "--height",
-        "64",
-        "--width",
-        "96",
-        "--output",
-    ] + [picture]
+    plainly = "--network erf-posenet-dilated --height 64 --width 96 --output"
+    options = [*plainly.split(), picture]
     plain = ["--network", "posenet", "--weights", weights, "--images", images]
     code, out, err = run("receptive-field", *plain, *options)
     assert (code, err) == (0, "")

@@ -42,32 +42,12 @@ CHROMIUM = (
     or ""
 )
 FLAGS = (
-    *(
-        "--headless",
-        "--no-sandbox",
-        "--disable-gpu",
-        "--disable-quic",
-        "--no-first-run",
-        "--hide-scrollbars",
-    ),
-    *(
-        "--disable-background-networking",
-        "--disable-component-update",
-        "--disable-sync",
-        "--disable-default-apps",
-    ),
-    *(
-        "--use-gl=angle",
-        "--use-angle=swiftshader",
-        "--enable-unsafe-swiftshader",
-        "--enable-logging=stderr",
-    ),
-    *(
-        "--window-size=640,480",
-        "--virtual-time-budget=12000",
-        "--host-resolver-rules=MAP * ~NOTFOUND",
-    ),
+    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --hide-scrollbars "
+    "--disable-background-networking --disable-component-update --disable-sync "
+    "--disable-default-apps --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
+    "--enable-logging=stderr --window-size=640,480 --virtual-time-budget=12000"
 )
+NO_HOSTS = "--host-resolver-rules=MAP * ~NOTFOUND"
 SLOW = re.compile(
     "GPU stall due to ReadPixels|willReadFrequently"
 )  # of the screenshot, and of words in a scene
@@ -362,7 +342,7 @@ def report(make_run: MakeRun, view: MapView) -> Path:
 def browse(page: Path, *options: str) -> tuple[str, list[str]]:
     """Standard output of the browser, and the lines of its console."""
     profile = f"--user-data-dir={page.parent / 'profile'}"
-    command = [CHROMIUM, *FLAGS, profile, *options, page.as_uri()]
+    command = [CHROMIUM, *FLAGS.split(), NO_HOSTS, profile, *options, page.as_uri()]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
     lines = [
         line for line in ended.stderr.splitlines() if "CONSOLE" in line and not SLOW.search(line)

@@ -49,7 +49,7 @@ def deform_conv2d(
         places = max(1, min(places, _CPU_CHUNK // (channels * taps)))
         images = max(1, min(batch, _CPU_CHUNK // (channels * taps * places)))
     split = [torch.split(tensor, images) for tensor in (maps, grid, factors)]
-    chunks = [_sample_and_combine(*parts, weight, places) for parts in zip(*split)]
+    chunks = [_sample_and_combine(weight, places, *parts) for parts in zip(*split)]
     return _join(chunks, dim=0).view(batch, weight.shape[0], out_h, out_w)
 
 
@@ -135,18 +135,18 @@ def _sampling_grid(offset: Tensor, rows: Tensor, columns: Tensor, size: tuple[in
 
 
 def _sample_and_combine(
-    maps: Tensor, grid: Tensor, factors: Tensor, weight: Tensor, places: int
+    weight: Tensor, places: int, maps: Tensor, grid: Tensor, factors: Tensor
 ) -> Tensor:
     """Sample the taps of some images, `places` outputs at a time, and multiply them by the kernel.
 
     `split` rather than slices: the gradient of n slices is n full-size sums.
 
     Args:
+        weight: kernel, ``(C_out, C_in, k, k)``.
+        places: outputs handled at once.
         maps: inputs, ``(b, C_in, H, W)``.
         grid: sampling positions, ``(b, taps, H_out * W_out, 2)``.
         factors: tap factors, ``(b, 1, taps, H_out * W_out)``.
-        weight: kernel, ``(C_out, C_in, k, k)``.
-        places: outputs handled at once.
 
     Returns:
         ``(b, C_out, H_out * W_out)``.

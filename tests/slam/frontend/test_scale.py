@@ -260,15 +260,6 @@ def test_triangulation_propagates_rare_road_lengths_through_the_drive():
     np.testing.assert_allclose(solved.unit_correction, 0.5, rtol=0.1)
 
 
-def test_a_noisy_road_is_better_with_triangulation_than_without():
-    absolute = {"absolute": noisy(0.05), "absolute_sigma": np.full(STEPS, 0.06)}
-    alone = solve_lengths(evidence(**absolute)).length
-    together = solve_lengths(evidence(**absolute, **ratios(0.003))).length
-    errors = [np.sqrt(np.mean(np.log(lengths / TRUE) ** 2)) for lengths in (alone, together)]
-    assert errors[0] > 0.03
-    assert errors[1] < 0.4 * errors[0]
-
-
 def test_a_quarter_of_wrong_roads_does_not_matter():
     road = noisy(0.03)
     road[::4] += np.log(1.6)

@@ -52,7 +52,6 @@ def repeated_as_jpeg(sequence: SimulatedSequence, index: int) -> Frame:
         ".jpg", sequence.frame(BAD[0] - 1).image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality]
     )
     decoded = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
-    assert decoded is not None
     return Frame(index, float(sequence.stamps[index]), np.ascontiguousarray(decoded[..., ::-1]))
 
 
@@ -183,11 +182,6 @@ def test_ten_frames_are_interpolated_and_reported(damage: Damage) -> None:
         k.index for k in seen.keyframes
     } & set(BAD)
     assert not {view.index for view in seen.views} & set(BAD)
-
-
-@pytest.mark.slow
-def test_frozen_frames_cost_no_more_than_black_ones() -> None:
-    assert ate(run_on(repeated_as_jpeg)[0]) < 2 * ate(run_on(black)[0])
 
 
 def test_no_road_is_measured_in_the_sky() -> None:

@@ -8,12 +8,13 @@ from numpy.typing import NDArray
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
 from slam.simulation.carried import Carried, Floor
-from slam.simulation.geometry import Float32Array, FloatArray, Material, Mesh, Moving
+from slam.simulation.geometry import Float32Array, FloatArray, Material, Mesh
 from slam.simulation.interior import interior_of
 from slam.simulation.irradiance import irradiance_of
 from slam.simulation.objects import person
 from slam.simulation.options import SimulationOptions
 from slam.simulation.room_textures import GLOWING
+from slam.simulation.shapes import Moving
 from slam.simulation.world import (
     SHUTTER,
     Hits,
@@ -61,10 +62,8 @@ class SimulatedRooms(SimulatedWorld):
             for k in range(1, motions)
         ]
         rng = np.random.default_rng([options.seed, 57])
-        crowd = [
-            lambda soup: person(soup, rng, 0.0, 0.0)
-        ] * _PEOPLE  # around their own origins, looking along x
-        self._people = Moving(rng, crowd) if "people" in options.hazards else None
+        # around their own origins, looking along x
+        self._people = Moving(rng, [person] * _PEOPLE) if "people" in options.hazards else None
         fov = options.fov_deg or _USUAL_FOV_DEG
         if options.varied and options.fov_deg is None:
             fov = float(

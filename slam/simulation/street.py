@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.runtime.imports import import_open3d
-from slam.simulation.geometry import Float32Array, FloatArray, Mesh, Moving
+from slam.simulation.geometry import Float32Array, FloatArray, Mesh
 from slam.simulation.objects import bonnet, car
 from slam.simulation.options import SimulationOptions, draw_variety
 from slam.simulation.route import STEP, Route, plan_route
-from slam.simulation.shapes import frame_at
+from slam.simulation.shapes import Moving
 from slam.simulation.texture import Texels, fractal
 from slam.simulation.town import build_town
 from slam.simulation.world import (
@@ -138,7 +138,7 @@ class SimulatedStreet(SimulatedWorld):
         below = (
             self.options.height * (1.0 - self._variety.bonnet) - self.camera.cy
         ) / self.camera.fy
-        return Moving(rng, [lambda soup: bonnet(soup, rng, below, self.camera_height_m)])
+        return Moving(rng, [lambda site: bonnet(site, below, self.camera_height_m)])
 
     @functools.cached_property
     def _gain(self) -> float:
@@ -353,8 +353,7 @@ class Traffic:
             self._plan_passing(np.random.default_rng([seed, 34]))
         self._gap = float(rng.uniform(9.0, 14.0)) / STEP
         self._leader_leaves = float(rng.uniform(0.4, 0.8)) * len(drive.sample)
-        makers = [lambda soup: car(soup, rng, frame_at(0.0, 0.0, 0.0))] * (1 + len(self._courses))
-        self._cars = Moving(rng, makers)
+        self._cars = Moving(rng, [car] * (1 + len(self._courses)))
 
     def _plan_passing(self, rng: np.random.Generator) -> None:
         """Courses of cars on the camera's left, and of slower ones on its right."""

@@ -123,30 +123,18 @@ class SimulatedRooms(SimulatedWorld):
             {number: T for number, T in enumerate(T_scene_people) if far[number]}
         )
 
-    def _background(self, directions: Float32Array) -> Float32Array:
-        return np.zeros_like(directions)
-
-    def _shade(
-        self,
-        surfaces: list[Surface],
-        number: int,
-        hits: Hits,
-        rays: Float32Array,
-        pixels: NDArray[np.int64],
-    ) -> Float32Array:
-        rgb = surfaces[number].unlit(hits, self.camera.fx)
-        if number > 0:  # people are as bright as what is below them
-            down = rays.copy()
-            down[:, :3] += rays[:, 3:] * hits.depth[:, None]
-            down[:, 3:] = (0.0, 0.0, -1.0)
-            hits_below = self._still.cast(down)
-            below = np.minimum(
-                hits_below["primitive_ids"].astype(np.int64), self._irradiance.shape[1] - 1
-            )
-            return np.asarray(
-                rgb * self._irradiance[:, below].mean(axis=0) * (0.85 + 0.15 * hits.normals[2])
-            )
-        return np.asarray(rgb * self._light(hits.triangle, hits.barycentric))
+    def _shade(self, hits: Hits, surfaces: list[Surface]) -> Float32Array:
+        rgb = hits.unlit(self.camera.fx)
+        if hits.surface is self._still:
+            return np.asarray(rgb * self._light(hits.triangle, hits.barycentric))
+        # people are as bright as what is below them
+        down = hits.rays.copy()
+        down[:, :3] += down[:, 3:] * hits.depth[:, None]
+        down[:, 3:] = (0.0, 0.0, -1.0)
+        below = self._still.cast(down)["primitive_ids"].astype(np.int64)
+        below = np.minimum(below, self._irradiance.shape[1] - 1)
+        light = self._irradiance[:, below].mean(axis=0)
+        return np.asarray(rgb * light * (0.85 + 0.15 * hits.normals[2]))
 
     def _light(self, triangle: NDArray[np.int64], barycentric: Float32Array) -> Float32Array:
         """Irradiance at points of triangles ``(N,)``; of what glows, its own light."""

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
@@ -19,7 +18,7 @@ from slam.simulation.objects import bonnet, car
 from slam.simulation.options import SimulationOptions, draw_variety
 from slam.simulation.route import STEP, Route, plan_route
 from slam.simulation.shapes import Moving
-from slam.simulation.texture import Texels, fractal
+from slam.simulation.texture import Axis, Texels
 from slam.simulation.town import build_town
 from slam.simulation.world import (
     SHUTTER,
@@ -147,7 +146,7 @@ class SimulatedStreet(SimulatedWorld):
             return self._weather.exposure
         frames = (0, len(self) // 2, len(self) - 1)
         views = [
-            self._view(self._surfaces(index), self._route.T_street_camera[index])[0]
+            self._view(self._surfaces(index), self._route.T_street_camera[index])
             for index in frames
         ]
         brightest = float(np.quantile(np.max(views, axis=-1), 1.0 - self._weather.saturated))
@@ -175,9 +174,11 @@ class SimulatedStreet(SimulatedWorld):
         plane = directions[:2] / (up + 0.12)
         still = np.zeros_like(up)
         size = 0.006 / (up + 0.12)
-        texels = Texels(plane[0], plane[1], size, size, still, still)
+        x, y = (Axis(at, size, still) for at in plane)
         cover = (
-            fractal(texels, (1.6, 1.6, 0.6), (0.6, 0.6, 0.35), (0.22, 0.22, 0.18))
+            Texels(x, y, rgb, rgb, rgb).fractal(
+                (1.6, 1.6, 0.6), (0.6, 0.6, 0.35), (0.22, 0.22, 0.18)
+            )
             + weather.clouds
             - 0.5
         )
@@ -185,17 +186,10 @@ class SimulatedStreet(SimulatedWorld):
         white = 0.88 + 0.08 * np.clip(cover, 0.0, 1.0)
         return np.asarray(rgb + fraction * (white - rgb), dtype=np.float32)
 
-    def _shade(
-        self,
-        surfaces: list[Surface],
-        number: int,
-        hits: Hits,
-        rays: Float32Array,
-        pixels: NDArray[np.int64],
-    ) -> Float32Array:
-        weather, mesh = self._weather, surfaces[number].mesh
+    def _shade(self, hits: Hits, surfaces: list[Surface]) -> Float32Array:
+        weather, mesh = self._weather, hits.surface.mesh
         towards = np.flatnonzero(weather.sun @ hits.normals > 0.0)
-        to_sun = np.take(rays, towards, axis=0)
+        to_sun = np.take(hits.rays, towards, axis=0)
         to_sun[:, :3] += (
             to_sun[:, 3:] * hits.depth[towards, None] + 0.03 * hits.normals[:, towards].T
         )
@@ -205,11 +199,11 @@ class SimulatedStreet(SimulatedWorld):
             [surface.scene.test_occlusions(tensor).numpy() for surface in surfaces], axis=0
         )
         lit = np.ones(self.options.height * self.options.width, dtype=np.float32)
-        lit[pixels[towards]] = 1.0 - shadow
+        lit[hits.pixels[towards]] = 1.0 - shadow
         # over neighbouring pixels
         soft = cv2.blur(lit.reshape(self.options.height, self.options.width), (3, 3))
-        lit = np.asarray(np.take(soft, pixels), dtype=np.float32)
-        rgb = surfaces[number].unlit(hits, self.camera.fx)
+        lit = np.asarray(np.take(soft, hits.pixels), dtype=np.float32)
+        rgb = hits.unlit(self.camera.fx)
         if weather.contrast != 1.0:
             base = np.take(mesh.colours[0], np.take(mesh.instance, hits.triangle), axis=1)
             rgb *= np.clip(1.15 * rgb / base, 0.2, 2.0) ** np.float32(weather.contrast - 1.0)
@@ -218,7 +212,8 @@ class SimulatedStreet(SimulatedWorld):
         warm = np.array([[1.05], [1.0], [0.92]], dtype=np.float32)
         cool = np.array([[0.96], [1.0], [1.06]], dtype=np.float32)
         rgb *= np.asarray(direct * warm + around * cool, dtype=np.float32)  # irradiance
-        haze = -np.expm1(-hits.distance / np.float32(weather.visibility_m))
+        distance = hits.depth * self._stretch[hits.pixels]
+        haze = -np.expm1(-distance / np.float32(weather.visibility_m))
         return np.asarray(rgb + haze * (weather.horizon[:, None] - rgb), dtype=np.float32)
 
     def _develop(self, rgb: Float32Array, index: int) -> Float32Array:

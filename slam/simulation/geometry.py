@@ -1,7 +1,8 @@
 """Triangle meshes with materials, and the terrain that the streets of a plan are bent onto."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,7 +69,7 @@ class Bend:
             sway_y = self.amplitudes[1] * np.sin(k[1] * x + self.phases[1, 0])
             return np.stack([x + sway_x, y + sway_y, z + hill], axis=-1)
         steps = np.arange(len(self.road)) + self.road_start
-        centre_x, centre_y, heading = (np.interp(x, steps, self.road[:, i]) for i in range(3))
+        centre_x, centre_y, heading = interpolated(x, steps, self.road).T
         return np.stack(
             [centre_x - y * np.sin(heading), centre_y + y * np.cos(heading), z + hill], axis=-1
         )
@@ -110,10 +111,9 @@ def road_bend(
             * np.sin(2 * np.pi * s / wavelength + rng.uniform(0, 6.28))
         )
     position = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], 1), axis=0)
-    return Bend(
-        town.amplitudes,
-        town.wavelengths,
-        town.phases,
-        np.column_stack([position, heading]),
-        float(s[0]),
-    )
+    return replace(town, road=np.column_stack([position, heading]), road_start=float(s[0]))
+
+
+def interpolated(at: FloatArray, known: NDArray[Any], rows: FloatArray) -> FloatArray:
+    """Rows ``(M, C)`` of increasing places ``(M,)`` at other places ``(N,)``, ``(N, C)``."""
+    return np.stack([np.interp(at, known, column) for column in rows.T], axis=-1)

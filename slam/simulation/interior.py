@@ -11,20 +11,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.simulation.furniture import CLOTHS, PAINTS, STANDING, TALL, WOODS, Piece, dining
+from slam.simulation.furniture import STANDING, TALL, Piece, dining
 from slam.simulation.geometry import FLAT, FloatArray, Material
 from slam.simulation.shapes import UP, Rectangle, Site
 
 WALL = 0.14  # thickness, metres
 KINDS = ("living", "kitchen", "office", "bedroom", "bath", "office")
 DOOR_HEIGHT = 2.1
-_WALLS = (
-    (0.86, 0.84, 0.79),
-    (0.80, 0.82, 0.84),
-    (0.78, 0.72, 0.60),
-    (0.66, 0.72, 0.68),
-    (0.74, 0.62, 0.56),
-)
 _AISLE = 1.0  # left free between the furniture at the walls and the table in the middle, metres
 _DEEPEST = 0.65  # piece at a wall, metres
 _STEP = 0.5  # between the vertices of walls, which carry the light, metres
@@ -122,8 +115,8 @@ class Interior:
         self.house, self.site = draw_house(seed), Site(rng)
         self.obstacles: list[Rectangle] = []
         self._lights: list[tuple[float, float, float, float]] = []
-        self.frame_look = self.site.painted(Material.WOOD, *WOODS)
-        self.skirting = self.site.colour((0.85, 0.84, 0.80), *WOODS)
+        self.frame_look = self.site.painted(Material.WOOD, "wood")
+        self.skirting = self.site.colour("skirting")
         for room in self.house.rooms:
             self._enclose_and_fill(room)
         for door in self.house.doors:
@@ -135,17 +128,17 @@ class Interior:
         rng, site, (x0, y0, x1, y1) = self.rng, self.site, room.area
         east, north = np.array([x1 - x0, 0.0, 0.0]), np.array([0.0, y1 - y0, 0.0])
         if room.kind in ("living", "bedroom", "office"):
-            tone = site.colour(*WOODS)
+            tone = site.colour("wood")
             floor = site.instance(Material.BOARDS, tone, None, (rng.uniform(0.07, 0.16),))
         else:
             side = rng.uniform(0.9, 1.3) if room.kind == "hall" else rng.uniform(0.2, 0.5)
-            tone = site.colour((0.62, 0.60, 0.57), (0.50, 0.51, 0.53), (0.68, 0.58, 0.46))
+            tone = site.colour("floor tiles")
             chequered = room.kind in ("bath", "kitchen") and rng.random() < 0.4
             floor = site.instance(Material.TILES, tone, 0.75 * tone, (side, 0.008, chequered))
         self._panel(np.array([x0, y0, 0.0]), east, north, floor)
-        ceiling = site.painted(Material.PLASTER, (0.88, 0.88, 0.86), spread=0.02)
+        ceiling = site.painted(Material.PLASTER, "ceiling")
         self._panel(np.array([x0, y0, room.height]), north, east, ceiling)
-        tone = site.colour(*_WALLS, spread=0.04)
+        tone = site.colour("wall")
         if room.kind == "bath":
             wall = site.instance(Material.TILES, tone, 0.8 * tone, (rng.uniform(0.1, 0.25), 0.006))
         else:
@@ -222,7 +215,7 @@ class Interior:
         """A picture, a poster, a mirror or a screen at the height of the eyes."""
         rng = self.rng
         across, high = rng.uniform(0.4, min(width, 1.2)), rng.uniform(0.4, 0.8)
-        first, second = place.colour(*PAINTS), place.colour(*CLOTHS)
+        first, second = place.colour("paint"), place.colour("cloth")
         kind = rng.random()
         if kind < 0.75:
             size = across, high, float(rng.integers(3))
@@ -273,7 +266,7 @@ class Interior:
             return
         if room.kind in ("living", "bedroom", "office") and free.min() > 0.2:
             size = np.minimum(free + 1.0, 2.6)
-            tones = self.site.colour(*CLOTHS), self.site.colour(*PAINTS)
+            tones = self.site.colour("cloth"), self.site.colour("paint")
             motif = rng.uniform(0.2, 0.5)
             carpet = self.site.instance(Material.CARPET, *tones, (*size, motif))
             corner = np.array([*(low + 0.5 * (free - size)), 0.01])

@@ -13,23 +13,14 @@ def building(site: Site, width: float, depth: float) -> None:
     rng = site.rng
     floor, floors = rng.uniform(2.7, 3.4), rng.integers(1, 5)
     height = floors * floor + rng.uniform(0.4, 0.9)
-    plaster = site.colour(
-        (0.72, 0.66, 0.55), (0.62, 0.36, 0.27), (0.82, 0.80, 0.76), (0.66, 0.58, 0.42),
-        (0.52, 0.52, 0.54), (0.75, 0.55, 0.42), (0.55, 0.60, 0.62), (0.48, 0.30, 0.25),
-    )  # fmt: skip
+    plaster = site.colour("house")
     window_width = rng.uniform(0.8, 1.6)
     spacing = window_width + rng.uniform(0.6, 1.9)
-    trim = site.colour((0.85, 0.85, 0.82), (0.30, 0.24, 0.20), (0.45, 0.50, 0.45), spread=0.08)
+    trim = site.colour("window frame")
     style = rng.choice(3, p=[0.45, 0.35, 0.2])  # plaster, brick, boards
     look = (floor, spacing, window_width, rng.uniform(1.1, 1.7), style, height)
     wall = site.instance(Material.WALL, plaster, trim, look)
-    roof = site.painted(
-        Material.ROOF,
-        (0.45, 0.22, 0.16),
-        (0.30, 0.28, 0.28),
-        (0.50, 0.33, 0.24),
-        (0.24, 0.22, 0.24),
-    )
+    roof = site.painted(Material.ROOF, "roof")
     site.box(np.zeros(3), (width, depth, height), wall, roof)
     if rng.random() < 0.65:
         _gable(site, (width, depth, height), wall, roof)
@@ -72,10 +63,8 @@ def _gable(site: Site, size: tuple[float, float, float], wall: int, roof: int) -
 def tree(site: Site, size: float) -> None:
     """A trunk with a crown of lumpy balls, or a conifer of stacked cones."""
     rng, foot = site.rng, site.origin
-    bark = site.painted(Material.BARK, (0.32, 0.25, 0.19), (0.42, 0.38, 0.33), spread=0.04)
-    green = site.colour(
-        (0.20, 0.33, 0.12), (0.30, 0.40, 0.15), (0.15, 0.27, 0.14), (0.42, 0.40, 0.16), spread=0.03
-    )
+    bark = site.painted(Material.BARK, "bark")
+    green = site.colour("tree")
     leaves = site.instance(Material.LEAVES, green, green * rng.uniform(0.35, 0.6))
     trunk = size * rng.uniform(0.28, 0.42)
     lean = np.array([*rng.normal(0.0, 0.04, 2), 1.0])
@@ -94,14 +83,14 @@ def hedge(site: Site, length: float) -> None:
     """A hedge, a fence or a low wall along the place's x axis."""
     kind, height = site.rng.random(), site.rng.uniform(0.8, 1.7)
     if kind < 0.5:
-        green = site.colour((0.17, 0.30, 0.12), (0.25, 0.34, 0.14), spread=0.03)
+        green = site.colour("hedge")
         look, thick = site.instance(Material.LEAVES, green, 0.5 * green), 0.6
     elif kind < 0.8:
-        wood = site.colour((0.45, 0.33, 0.22), (0.75, 0.75, 0.72), (0.25, 0.27, 0.26))
+        wood = site.colour("fence")
         gap = site.rng.uniform(0.14, 0.3)
         look, thick = site.instance(Material.FENCE, wood, 0.35 * wood, (gap, height)), 0.06
     else:
-        stone = site.colour((0.58, 0.55, 0.50), (0.52, 0.38, 0.30))
+        stone = site.colour("garden wall")
         look = site.instance(Material.WALL, stone, None, (99.0, 99.0, 0.0, 0.0, 1.0, height))
         thick = 0.3
     site.box(np.zeros(3), (length, thick, height), look)
@@ -109,7 +98,7 @@ def hedge(site: Site, length: float) -> None:
 
 def lamp(site: Site, towards: FloatArray) -> None:
     """A street lamp whose arm reaches ``towards`` the road, a plan direction ``(2,)``."""
-    steel = site.painted(Material.METAL, (0.42, 0.44, 0.45), (0.20, 0.26, 0.22), spread=0.04)
+    steel = site.painted(Material.METAL, "street lamp")
     top = site.origin + site.rng.uniform(5.0, 8.0) * UP
     site.tube(site.origin, top, (0.10, 0.06), steel)
     reach = np.array([*towards, 0.12])
@@ -118,12 +107,10 @@ def lamp(site: Site, towards: FloatArray) -> None:
 
 def sign(site: Site) -> None:
     """A traffic sign on a post; its plate faces traffic that drives along the place's y axis."""
-    steel = site.painted(Material.METAL, (0.55, 0.56, 0.57), spread=0.03)
+    steel = site.painted(Material.METAL, "sign post")
     height = site.rng.uniform(2.1, 2.7)
     site.tube(site.origin, site.origin + (height + 0.3) * UP, (0.04, 0.04), steel)
-    paint = site.colour(
-        (0.70, 0.08, 0.08), (0.08, 0.20, 0.60), (0.85, 0.65, 0.08), (0.10, 0.40, 0.20)
-    )
+    paint = site.colour("sign")
     half = site.rng.uniform(0.3, 0.45)
     kind = float(site.rng.integers(3))
     plate = site.instance(Material.SIGN, paint, (0.92, 0.92, 0.90), (half, kind))
@@ -133,13 +120,7 @@ def sign(site: Site) -> None:
 def railing(site: Site, length: float) -> None:
     """Posts and bars along the place's x axis, which one sees through."""
     rng = site.rng
-    steel = site.painted(
-        Material.METAL,
-        (0.55, 0.56, 0.57),
-        (0.18, 0.20, 0.20),
-        (0.72, 0.72, 0.70),
-        (0.42, 0.30, 0.20),
-    )
+    steel = site.painted(Material.METAL, "railing")
     height, spacing = rng.uniform(0.6, 1.3), rng.choice([0.15, 0.3, 1.5, 2.5])
     radii = (rng.uniform(0.015, 0.05),) * 2
     posts = np.arange(0.0, length, max(spacing, length / 120))
@@ -154,8 +135,8 @@ def railing(site: Site, length: float) -> None:
 def wire_fence(site: Site, length: float) -> None:
     """Wooden posts and the wires between them along the place's x axis."""
     rng = site.rng
-    wood = site.painted(Material.BARK, (0.42, 0.36, 0.29), (0.55, 0.52, 0.48), spread=0.03)
-    wire = site.painted(Material.METAL, (0.5, 0.5, 0.5), spread=0.03)
+    wood = site.painted(Material.BARK, "fence post")
+    wire = site.painted(Material.METAL, "wire")
     height = rng.uniform(0.9, 1.4)
     posts = np.arange(0.0, length, rng.uniform(2.0, 4.0)).tolist()
     for along in posts:
@@ -169,7 +150,7 @@ def wire_fence(site: Site, length: float) -> None:
 
 def barrier(site: Site, length: float, concrete: bool) -> None:
     """A wall of concrete, or a steel rail on posts, along the place's x axis in pieces of 4 m."""
-    grey = site.colour((0.62, 0.61, 0.58), (0.5, 0.5, 0.5), spread=0.04)
+    grey = site.colour("barrier")
     look = site.instance(Material.GRAVEL if concrete else Material.METAL, grey, 0.8 * grey)
     for along in np.arange(0.0, length - 3.9, 4.0).tolist():
         place = site.moved(along)
@@ -183,7 +164,7 @@ def barrier(site: Site, length: float, concrete: bool) -> None:
 
 def post(site: Site) -> None:
     """A bollard, a guide post or a mast."""
-    steel = site.painted(Material.METAL, (0.85, 0.85, 0.82), (0.30, 0.28, 0.26), (0.50, 0.50, 0.52))
+    steel = site.painted(Material.METAL, "post")
     radius = site.rng.uniform(0.03, 0.12)
     tip = site.origin + site.rng.choice([1.0, 3.0, 7.0]) * UP
     site.tube(site.origin, tip, (radius, 0.8 * radius), steel)
@@ -191,9 +172,11 @@ def post(site: Site) -> None:
 
 def person(site: Site) -> None:
     """Legs, body and head of somebody who stands 10 cm above the place."""
-    clothes = (0.2, 0.2, 0.25), (0.6, 0.2, 0.2), (0.7, 0.7, 0.68), (0.2, 0.3, 0.55)
-    trousers, coat = site.painted(Material.METAL, *clothes), site.painted(Material.METAL, *clothes)
-    skin = site.painted(Material.METAL, (0.75, 0.58, 0.47), (0.45, 0.32, 0.25), spread=0.03)
+    trousers, coat = (
+        site.painted(Material.METAL, "clothes"),
+        site.painted(Material.METAL, "clothes"),
+    )
+    skin = site.painted(Material.METAL, "skin")
     size = site.rng.uniform(0.85, 1.08)
     foot = site.origin + 0.1 * UP
     side = 0.12 * np.array([*np.sin(site.rng.uniform(0, 7) + np.array([0, np.pi / 2])), 0.0])
@@ -216,24 +199,14 @@ def bonnet(site: Site, below: float, height_m: float) -> None:
         + 0.10 * x**2
         + 0.25 * np.clip(np.abs(x) - 0.7, 0.0, None)
     )
-    paint = site.painted(
-        Material.METAL,
-        (0.7, 0.7, 0.72),
-        (0.08, 0.08, 0.09),
-        (0.35, 0.36, 0.38),
-        (0.5, 0.08, 0.08),
-        (0.1, 0.16, 0.4),
-    )
+    paint = site.painted(Material.METAL, "bonnet")
     site.patch(np.stack([x, y, z], axis=2), np.stack([x, z], axis=2), paint)
 
 
 def car(site: Site) -> None:
     """A car centred on the place and pointing along its x axis: body, cabin and wheels."""
     rng = site.rng
-    lacquer = site.colour(
-        (0.75, 0.76, 0.78), (0.10, 0.10, 0.11), (0.45, 0.46, 0.48), (0.55, 0.08, 0.08),
-        (0.10, 0.18, 0.42), (0.85, 0.85, 0.84), (0.20, 0.32, 0.22), (0.70, 0.55, 0.15),
-    )  # fmt: skip
+    lacquer = site.colour("car")
     paint = site.instance(Material.PAINT, lacquer, 0.4 * lacquer, (1.0,))
     glass = site.instance(Material.GLASS, (0.10, 0.12, 0.14), 0.8 * lacquer, (1.0,))
     tyre = site.instance(Material.TYRE, (0.05, 0.05, 0.05), (0.5, 0.5, 0.5), (0.32,))

@@ -4,10 +4,15 @@ import copy
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from erfsfm.common.config_tree import parse_yaml
+from erfsfm.common.files import read_text
 from slam.simulation.geometry import (
     FLAT,
     PARAMETERS,
@@ -19,12 +24,17 @@ from slam.simulation.geometry import (
     Mesh,
 )
 
-Colour = tuple[float, float, float]
 Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1
 
 UP = np.array([0.0, 0.0, 1.0])
 # fields of a mesh whose last axis is that of its triangles
 _OF_TRIANGLES = ("uv", "normals", "tangents", "instance", "material")
+
+
+@functools.cache
+def _palettes() -> Any:
+    """Spread and colours of each thing."""
+    return parse_yaml(read_text(Path(__file__).with_name("colours.yaml")))
 
 
 @functools.lru_cache(maxsize=256)
@@ -83,9 +93,10 @@ class Site:
         site.rng = rng
         return site
 
-    def colour(self, *choices: Colour, spread: float = 0.06) -> FloatArray:
-        """One of the given colours, a little off, ``(3,)``."""
-        base = np.array(choices[self.rng.integers(len(choices))])
+    def colour(self, thing: str) -> FloatArray:
+        """One of the colours that a thing of ``colours.yaml`` may have, a little off, ``(3,)``."""
+        spread, colours = itemgetter("spread", "colours")(_palettes()[thing])
+        base = np.array(colours[self.rng.integers(len(colours))])
         off = self.rng.normal(0.0, spread) + self.rng.normal(0.0, 0.4 * spread, 3)
         return np.asarray(np.clip(base + off, 0.02, 1.0))
 
@@ -103,9 +114,9 @@ class Site:
         self._looks.append((int(material), colours, row))
         return len(self._looks) - 1
 
-    def painted(self, material: Material, *choices: Colour, spread: float = 0.06) -> int:
-        """An `instance` of one of the given colours alone."""
-        return self.instance(material, self.colour(*choices, spread=spread))
+    def painted(self, material: Material, thing: str) -> int:
+        """An `instance` of one of the colours of a thing alone."""
+        return self.instance(material, self.colour(thing))
 
     def patch(self, points: FloatArray, uv: FloatArray, instance: int) -> None:
         """Add a grid of quads.

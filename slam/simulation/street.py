@@ -17,7 +17,7 @@ from slam.simulation.geometry import Float32Array, FloatArray, Mesh
 from slam.simulation.objects import bonnet, car
 from slam.simulation.options import SimulationOptions, draw_variety
 from slam.simulation.route import STEP, Route, plan_route
-from slam.simulation.shapes import Colour, Moving
+from slam.simulation.shapes import Moving
 from slam.simulation.texture import Axis, Texels
 from slam.simulation.town import build_town
 from slam.simulation.world import (
@@ -270,7 +270,7 @@ def _draw_sun(rng: np.random.Generator, lowest: float, highest: float) -> FloatA
 
 
 def _draw_tint(
-    rng: np.random.Generator, tint: Colour, spread: float, bright: float = 1.0
+    rng: np.random.Generator, tint: tuple[float, ...], spread: float, bright: float = 1.0
 ) -> Float32Array:
     """A colour of the sky near another, ``(3,)``."""
     return np.asarray(bright * (tint + rng.uniform(-spread, spread, 3)), dtype=np.float32)

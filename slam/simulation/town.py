@@ -52,9 +52,9 @@ class _Town:
         self.tallness = 1.0  # of trees at the kerb
         self.open = plan.kind in ("country", "motorway")  # no houses, no pavements
         self.foot = KERB - (0.1 if more is None else 0.6)  # of houses, below the ground on hills
-        grey = site.colour((0.36, 0.36, 0.37), (0.28, 0.28, 0.30), (0.42, 0.41, 0.39), spread=0.03)
-        stone = site.colour((0.55, 0.54, 0.52), (0.50, 0.46, 0.43), spread=0.04)
-        turf = site.colour((0.26, 0.36, 0.14), (0.34, 0.38, 0.18), spread=0.02)
+        grey = site.colour("asphalt")
+        stone = site.colour("pavement")
+        turf = site.colour("grass")
         paint = (0.80, 0.80, 0.76)
         dash = rng.uniform(3.0, 6.0)
         fraction = rng.uniform(0.35, 0.6)

@@ -49,12 +49,10 @@ def places() -> Places:
     frames = range(0, FRAMES, 3)
     views = []
     for k in frames:
-        rendered = sequence.street.render(k)
-        depth = np.where(rendered.depth > 0, rendered.depth, np.nan).astype(np.float32)
+        image, depth = sequence.street.render(k), sequence.street.depth(k)
+        depth[depth == 0] = np.nan
         views.append(
-            extractor.view(
-                Frame(k, 0.1 * k, rendered.image), depth, sequence.camera_height_m
-            ).scaled(UNIT)
+            extractor.view(Frame(k, 0.1 * k, image), depth, sequence.camera_height_m).scaled(UNIT)
         )
     T_world_camera = reference()[list(frames)].copy()
     T_world_camera[:, :3, 3] *= UNIT

@@ -112,7 +112,7 @@ def close_corners() -> Iterator[None]:
 
 def oracle_of(sequence: Damaged, rows: Sequence[int] = range(FRAMES)) -> OraclePredictor:
     def depth_of(index: int) -> np.ndarray:
-        depth = street().street.render(rows[index]).depth
+        depth = street().street.depth(rows[index])
         return np.where(depth > 0, depth, 200.0)
 
     return OraclePredictor(

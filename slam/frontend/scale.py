@@ -322,6 +322,24 @@ class StepEvidence:
         change = _ACCELERATION_SIGMA * camera_height * duration
         return np.asarray(change / np.maximum(speed[1:], speed[:-1]))
 
+    def contradicted(
+        self, log_length: FloatArray, log_unit: FloatArray, speed_sigma: FloatArray
+    ) -> NDArray[np.bool_]:
+        """Which lengths are not what learned depth says, or change as no vehicle's does ``(S,)``.
+
+        Args:
+            log_length: solved ``(S,)``.
+            log_unit: of learned depth over the prior ``(S,)``.
+            speed_sigma: by `steady_sigma` ``(S - 1,)``.
+        """
+        unit_before = np.concatenate([log_unit[:1], log_unit[:-1]])
+        by_learned = self.learned + unit_before - log_length
+        by_learned /= self.learned_noise() * _LEARNED_SIGMA
+        change = np.diff(log_length) - np.diff(np.log(self.seconds))
+        by_speed = np.concatenate([[np.nan], change / np.hypot(speed_sigma, _LENGTH_SIGMA)])
+        worst = np.fmax(np.abs(by_learned), np.abs(by_speed))
+        return np.asarray(worst > _CONTRADICTION_SIGMAS)
+
     @classmethod
     def empty(cls, steps: int) -> StepEvidence:
         """Without a measurement."""
@@ -394,7 +412,6 @@ def solve_lengths(evidence: StepEvidence, camera_height: float = 1.0) -> StepLen
     lengths, units = 2 * np.arange(steps), 2 * np.arange(steps) + 1
     ratio_sigma = np.hypot(_RATIO_WIDENING * evidence.ratio_sigma, _RATIO_SIGMA)
     noise = evidence.learned_noise()
-    learned_sigma = noise * _LEARNED_SIGMA
     beside_road = np.where(np.isfinite(evidence.absolute), _BESIDE_ROAD, 1.0)
     ones = np.ones(steps)
     steady = np.diff(np.log(evidence.seconds))
@@ -405,7 +422,7 @@ def solve_lengths(evidence: StepEvidence, camera_height: float = 1.0) -> StepLen
         (units[1:], units[:-1], 0.0 * ones[1:], noise * _UNIT_WALK_SIGMA * ones[1:]),
         (lengths[1:], lengths[:-1], evidence.ratio[1:], ratio_sigma[1:]),
         (lengths, zero, evidence.absolute, evidence.absolute_sigma),
-        (lengths, units, evidence.learned, learned_sigma * beside_road),
+        (lengths, units, evidence.learned, noise * _LEARNED_SIGMA * beside_road),
         (units, zero, evidence.plane, noise**2 * _PLANE_SIGMA * ones),
         # one prior on the unit of the whole drive, divided among its steps
         (units, zero, 0.0 * ones, _UNIT_SIGMA * np.sqrt(steps) * ones),
@@ -441,13 +458,7 @@ def solve_lengths(evidence: StepEvidence, camera_height: float = 1.0) -> StepLen
         _CORRELATED_WIDENING * sigmas * np.sqrt((1.0 + correlations) / (1.0 - correlations))
     )
     sigmas, correlated_sigmas = of_measured * sigmas, of_measured * correlated_sigmas
-    unit_before = np.concatenate([log_unit[:1], log_unit[:-1]])
-    by_learned = (evidence.learned + unit_before - log_length) / learned_sigma
-    change = (np.diff(log_length) - steady) / np.hypot(speed_sigma, _LENGTH_SIGMA)
-    by_speed = np.concatenate([[np.nan], change])
-    contradicted = (np.abs(by_learned) > _CONTRADICTION_SIGMAS) | (
-        np.abs(by_speed) > _CONTRADICTION_SIGMAS
-    )
+    contradicted = evidence.contradicted(log_length, log_unit, speed_sigma)
     return StepLengths(
         of_measured * np.exp(log_length), sigmas, correlated_sigmas, np.exp(log_unit), contradicted
     )

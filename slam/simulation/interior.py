@@ -115,7 +115,7 @@ class Interior:
         self.house, self.site = draw_house(seed), Site(rng)
         self.obstacles: list[Rectangle] = []
         self._lights: list[tuple[float, float, float, float]] = []
-        self.frame_look = self.site.painted(Material.WOOD, "wood")
+        self.frame_look = self.site.instance(Material.WOOD, "wood")
         self.skirting = self.site.colour("skirting")
         for room in self.house.rooms:
             self._enclose_and_fill(room)
@@ -129,18 +129,18 @@ class Interior:
         east, north = np.array([x1 - x0, 0.0, 0.0]), np.array([0.0, y1 - y0, 0.0])
         if room.kind in ("living", "bedroom", "office"):
             tone = site.colour("wood")
-            floor = site.instance(Material.BOARDS, tone, None, (rng.uniform(0.07, 0.16),))
+            floor = site.instance(Material.BOARDS, tone, 1.0, (rng.uniform(0.07, 0.16),))
         else:
             side = rng.uniform(0.9, 1.3) if room.kind == "hall" else rng.uniform(0.2, 0.5)
             tone = site.colour("floor tiles")
             chequered = room.kind in ("bath", "kitchen") and rng.random() < 0.4
-            floor = site.instance(Material.TILES, tone, 0.75 * tone, (side, 0.008, chequered))
+            floor = site.instance(Material.TILES, tone, 0.75, (side, 0.008, chequered))
         self._panel(np.array([x0, y0, 0.0]), east, north, floor)
-        ceiling = site.painted(Material.PLASTER, "ceiling")
+        ceiling = site.instance(Material.PLASTER, "ceiling")
         self._panel(np.array([x0, y0, room.height]), north, east, ceiling)
         tone = site.colour("wall")
         if room.kind == "bath":
-            wall = site.instance(Material.TILES, tone, 0.8 * tone, (rng.uniform(0.1, 0.25), 0.006))
+            wall = site.instance(Material.TILES, tone, 0.8, (rng.uniform(0.1, 0.25), 0.006))
         else:
             papered = rng.uniform(0.1, 0.3) if rng.random() < 0.2 else 0.0
             wall = site.instance(Material.PLASTER, tone, self.skirting, (0.08, papered, 0.08))

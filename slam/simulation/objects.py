@@ -20,7 +20,7 @@ def building(site: Site, width: float, depth: float) -> None:
     style = rng.choice(3, p=[0.45, 0.35, 0.2])  # plaster, brick, boards
     look = (floor, spacing, window_width, rng.uniform(1.1, 1.7), style, height)
     wall = site.instance(Material.WALL, plaster, trim, look)
-    roof = site.painted(Material.ROOF, "roof")
+    roof = site.instance(Material.ROOF, "roof")
     site.box(np.zeros(3), (width, depth, height), wall, roof)
     if rng.random() < 0.65:
         _gable(site, (width, depth, height), wall, roof)
@@ -63,7 +63,7 @@ def _gable(site: Site, size: tuple[float, float, float], wall: int, roof: int) -
 def tree(site: Site, size: float) -> None:
     """A trunk with a crown of lumpy balls, or a conifer of stacked cones."""
     rng, foot = site.rng, site.origin
-    bark = site.painted(Material.BARK, "bark")
+    bark = site.instance(Material.BARK, "bark")
     green = site.colour("tree")
     leaves = site.instance(Material.LEAVES, green, green * rng.uniform(0.35, 0.6))
     trunk = size * rng.uniform(0.28, 0.42)
@@ -83,22 +83,21 @@ def hedge(site: Site, length: float) -> None:
     """A hedge, a fence or a low wall along the place's x axis."""
     kind, height = site.rng.random(), site.rng.uniform(0.8, 1.7)
     if kind < 0.5:
-        green = site.colour("hedge")
-        look, thick = site.instance(Material.LEAVES, green, 0.5 * green), 0.6
+        look, thick = site.instance(Material.LEAVES, "hedge", 0.5), 0.6
     elif kind < 0.8:
         wood = site.colour("fence")
         gap = site.rng.uniform(0.14, 0.3)
-        look, thick = site.instance(Material.FENCE, wood, 0.35 * wood, (gap, height)), 0.06
+        look, thick = site.instance(Material.FENCE, wood, 0.35, (gap, height)), 0.06
     else:
-        stone = site.colour("garden wall")
-        look = site.instance(Material.WALL, stone, None, (99.0, 99.0, 0.0, 0.0, 1.0, height))
+        plain = (99.0, 99.0, 0.0, 0.0, 1.0, height)  # without windows
+        look = site.instance(Material.WALL, "garden wall", 1.0, plain)
         thick = 0.3
     site.box(np.zeros(3), (length, thick, height), look)
 
 
 def lamp(site: Site, towards: FloatArray) -> None:
     """A street lamp whose arm reaches ``towards`` the road, a plan direction ``(2,)``."""
-    steel = site.painted(Material.METAL, "street lamp")
+    steel = site.instance(Material.METAL, "street lamp")
     top = site.origin + site.rng.uniform(5.0, 8.0) * UP
     site.tube(site.origin, top, (0.10, 0.06), steel)
     reach = np.array([*towards, 0.12])
@@ -107,7 +106,7 @@ def lamp(site: Site, towards: FloatArray) -> None:
 
 def sign(site: Site) -> None:
     """A traffic sign on a post; its plate faces traffic that drives along the place's y axis."""
-    steel = site.painted(Material.METAL, "sign post")
+    steel = site.instance(Material.METAL, "sign post")
     height = site.rng.uniform(2.1, 2.7)
     site.tube(site.origin, site.origin + (height + 0.3) * UP, (0.04, 0.04), steel)
     paint = site.colour("sign")
@@ -120,7 +119,7 @@ def sign(site: Site) -> None:
 def railing(site: Site, length: float) -> None:
     """Posts and bars along the place's x axis, which one sees through."""
     rng = site.rng
-    steel = site.painted(Material.METAL, "railing")
+    steel = site.instance(Material.METAL, "railing")
     height, spacing = rng.uniform(0.6, 1.3), rng.choice([0.15, 0.3, 1.5, 2.5])
     radii = (rng.uniform(0.015, 0.05),) * 2
     posts = np.arange(0.0, length, max(spacing, length / 120))
@@ -135,8 +134,8 @@ def railing(site: Site, length: float) -> None:
 def wire_fence(site: Site, length: float) -> None:
     """Wooden posts and the wires between them along the place's x axis."""
     rng = site.rng
-    wood = site.painted(Material.BARK, "fence post")
-    wire = site.painted(Material.METAL, "wire")
+    wood = site.instance(Material.BARK, "fence post")
+    wire = site.instance(Material.METAL, "wire")
     height = rng.uniform(0.9, 1.4)
     posts = np.arange(0.0, length, rng.uniform(2.0, 4.0)).tolist()
     for along in posts:
@@ -150,8 +149,7 @@ def wire_fence(site: Site, length: float) -> None:
 
 def barrier(site: Site, length: float, concrete: bool) -> None:
     """A wall of concrete, or a steel rail on posts, along the place's x axis in pieces of 4 m."""
-    grey = site.colour("barrier")
-    look = site.instance(Material.GRAVEL if concrete else Material.METAL, grey, 0.8 * grey)
+    look = site.instance(Material.GRAVEL if concrete else Material.METAL, "barrier", 0.8)
     for along in np.arange(0.0, length - 3.9, 4.0).tolist():
         place = site.moved(along)
         if concrete:
@@ -164,7 +162,7 @@ def barrier(site: Site, length: float, concrete: bool) -> None:
 
 def post(site: Site) -> None:
     """A bollard, a guide post or a mast."""
-    steel = site.painted(Material.METAL, "post")
+    steel = site.instance(Material.METAL, "post")
     radius = site.rng.uniform(0.03, 0.12)
     tip = site.origin + site.rng.choice([1.0, 3.0, 7.0]) * UP
     site.tube(site.origin, tip, (radius, 0.8 * radius), steel)
@@ -173,10 +171,10 @@ def post(site: Site) -> None:
 def person(site: Site) -> None:
     """Legs, body and head of somebody who stands 10 cm above the place."""
     trousers, coat = (
-        site.painted(Material.METAL, "clothes"),
-        site.painted(Material.METAL, "clothes"),
+        site.instance(Material.METAL, "clothes"),
+        site.instance(Material.METAL, "clothes"),
     )
-    skin = site.painted(Material.METAL, "skin")
+    skin = site.instance(Material.METAL, "skin")
     size = site.rng.uniform(0.85, 1.08)
     foot = site.origin + 0.1 * UP
     side = 0.12 * np.array([*np.sin(site.rng.uniform(0, 7) + np.array([0, np.pi / 2])), 0.0])
@@ -199,7 +197,7 @@ def bonnet(site: Site, below: float, height_m: float) -> None:
         + 0.10 * x**2
         + 0.25 * np.clip(np.abs(x) - 0.7, 0.0, None)
     )
-    paint = site.painted(Material.METAL, "bonnet")
+    paint = site.instance(Material.METAL, "bonnet")
     site.patch(np.stack([x, y, z], axis=2), np.stack([x, z], axis=2), paint)
 
 
@@ -207,9 +205,9 @@ def car(site: Site) -> None:
     """A car centred on the place and pointing along its x axis: body, cabin and wheels."""
     rng = site.rng
     lacquer = site.colour("car")
-    paint = site.instance(Material.PAINT, lacquer, 0.4 * lacquer, (1.0,))
-    glass = site.instance(Material.GLASS, (0.10, 0.12, 0.14), 0.8 * lacquer, (1.0,))
-    tyre = site.instance(Material.TYRE, (0.05, 0.05, 0.05), (0.5, 0.5, 0.5), (0.32,))
+    paint = site.instance(Material.PAINT, lacquer, 0.4)
+    glass = site.instance(Material.GLASS, (0.10, 0.12, 0.14), 0.8 * lacquer)
+    tyre = site.instance(Material.TYRE, (0.05, 0.05, 0.05), (0.5, 0.5, 0.5))
     length = rng.uniform(3.7, 4.7)
     half = rng.uniform(0.82, 0.92)
     van = rng.random() < 0.2

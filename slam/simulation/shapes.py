@@ -104,19 +104,26 @@ class Site:
         self,
         material: Material,
         colour: ArrayLike,
-        colour2: ArrayLike | None = None,
+        second: ArrayLike = 1.0,
         parameters: tuple[float, ...] = (),
     ) -> int:
-        """Register an instance with its colours and parameters; return its number."""
+        """Register an instance with its colours and parameters; return its number.
+
+        Args:
+            material: selects its texture.
+            colour: RGB in [0, 1], ``(3,)``, or the name of a thing whose `colour` is drawn.
+            second: the same of the texture's second colour, or a share of the first.
+            parameters: of the texture.
+        """
         row = np.zeros(PARAMETERS)
         row[: len(parameters)] = parameters
-        colours = np.stack([colour, colour if colour2 is None else colour2])
-        self._looks.append((int(material), colours, row))
+        colour = self.colour(colour) if isinstance(colour, str) else np.array(colour)
+        if isinstance(second, str):
+            second = self.colour(second)
+        elif isinstance(second, float):
+            second = second * colour
+        self._looks.append((int(material), np.array([colour, second]), row))
         return len(self._looks) - 1
-
-    def painted(self, material: Material, thing: str) -> int:
-        """An `instance` of one of the colours of a thing alone."""
-        return self.instance(material, self.colour(thing))
 
     def patch(self, points: FloatArray, uv: FloatArray, instance: int) -> None:
         """Add a grid of quads.

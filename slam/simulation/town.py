@@ -67,9 +67,9 @@ class _Town:
             Material.JUNCTION, grey, paint, (0.0, 0.0, 0.0, 0.0, 0.0, smooth)
         )
         slab = (rng.uniform(0.5, 1.2),)
-        self.pavement = site.instance(Material.PAVEMENT, stone, 0.7 * stone, slab)
+        self.pavement = site.instance(Material.PAVEMENT, stone, 0.7, slab)
         self.kerb = site.instance(Material.KERB, 1.15 * stone, 0.6 * stone)
-        self.grass = site.instance(Material.GRASS, turf, 0.55 * turf)
+        self.grass = site.instance(Material.GRASS, turf, 0.55)
         self.gravel = site.instance(Material.GRAVEL, 0.9 * stone, 0.5 * stone)
         if self.open:
             self.pavement = self.kerb = self.grass if rng.random() < 0.6 else self.gravel

@@ -331,14 +331,12 @@ def test_a_camera_that_moves_too_little_to_be_told_from_the_frame_before_does_no
 
     monkeypatch.setattr(street_world, "plan_route", crawling)
     sequence = SimulatedSequence(SimulationOptions("straight", 2 * FRAMES, 3, 416, 128))
-    render = functools.lru_cache(2 * FRAMES)(sequence.street.render)
+    remembered = functools.lru_cache(2 * FRAMES)
+    render, depth = remembered(sequence.street.render), remembered(sequence.street.depth)
     monkeypatch.setattr(sequence.street, "render", render)
     noise = OracleNoise(np.deg2rad(0.1), 0.03, seed=2)
     predictor = OraclePredictor(
-        sequence.reference,
-        lambda k: np.where(render(k).depth > 0, render(k).depth, 200.0),
-        noise,
-        FACTOR,
+        sequence.reference, lambda k: np.where(depth(k) > 0, depth(k), 200.0), noise, FACTOR
     )
     config = config_with("mapping.enabled=false")
     result = SlamPipeline(sequence, predictor, config).run()

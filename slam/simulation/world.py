@@ -48,17 +48,12 @@ def place_rays(T_scene_sensor: FloatArray, directions: Float32Array) -> Float32A
     Of several poses ``(H, 4, 4)`` each is that of an equal share of the directions in turn, as of
     the rows of an image.
     """
-    rays = np.empty((len(directions), 6), dtype=np.float32)
-    if T_scene_sensor.ndim == 3:
-        by_row = directions.reshape(len(T_scene_sensor), -1, 3)
-        rays[:, :3] = np.repeat(T_scene_sensor[:, :3, 3], by_row.shape[1], axis=0)
-        rays[:, 3:] = (
-            by_row @ T_scene_sensor[:, :3, :3].swapaxes(1, 2).astype(np.float32)
-        ).reshape(-1, 3)
-        return rays
-    rays[:, :3] = T_scene_sensor[:3, 3]
-    rays[:, 3:] = directions @ T_scene_sensor[:3, :3].T.astype(np.float32)
-    return rays
+    poses = T_scene_sensor.reshape(-1, 4, 4)
+    of_pose = directions.reshape(len(poses), -1, 3)
+    rays = np.empty((*of_pose.shape[:2], 6), dtype=np.float32)
+    rays[..., :3] = poses[:, None, :3, 3]
+    rays[..., 3:] = of_pose @ poses[:, :3, :3].swapaxes(1, 2).astype(np.float32)
+    return rays.reshape(-1, 6)
 
 
 @dataclass(frozen=True)

@@ -117,3 +117,13 @@ def road_bend(
 def interpolated(at: FloatArray, known: NDArray[Any], rows: FloatArray) -> FloatArray:
     """Rows ``(M, C)`` of increasing places ``(M,)`` at other places ``(N,)``, ``(N, C)``."""
     return np.stack([np.interp(at, known, column) for column in rows.T], axis=-1)
+
+
+def unit(rows: FloatArray) -> FloatArray:
+    """Directions of vectors ``(N, 3)`` or ``(N, 2)``; those of no length stay as they are."""
+    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9))
+
+
+def luck(seed: int, *draw: int) -> np.random.Generator:
+    """The random numbers of one draw of a world: others do not change with them."""
+    return np.random.default_rng([seed, *draw])

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.simulation.furniture import STANDING, TALL, Piece, dining
-from slam.simulation.geometry import FLAT, FloatArray, Material
+from slam.simulation.geometry import FLAT, FloatArray, Material, luck
 from slam.simulation.shapes import UP, Rectangle, Site
 
 WALL = 0.14  # thickness, metres
@@ -71,7 +71,7 @@ class House:
 
 def draw_house(seed: int) -> House:
     """The plan of a world."""
-    rng = np.random.default_rng([seed, 50])
+    rng = luck(seed, 50)
     length, width, height = rng.uniform((14.0, 1.9, 2.45), (20.0, 2.4, 2.9)).tolist()
     corridor = Room("corridor", (0.0, 0.0, length, width), height, (3,))
     wide, deep = rng.uniform(9.0, 13.0), rng.uniform(7.5, 10.0)
@@ -111,7 +111,7 @@ class Interior:
 
     def __init__(self, seed: int) -> None:
         """The house of a world."""
-        self.rng = rng = np.random.default_rng([seed, 51])
+        self.rng = rng = luck(seed, 51)
         self.house, self.site = draw_house(seed), Site(rng)
         self.obstacles: list[Rectangle] = []
         self._lights: list[tuple[float, float, float, float]] = []

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
 from slam.simulation.carried import Carried, Floor
-from slam.simulation.geometry import Float32Array, FloatArray, Material, Mesh
+from slam.simulation.geometry import Float32Array, FloatArray, Material, Mesh, luck
 from slam.simulation.interior import interior_of
 from slam.simulation.irradiance import irradiance_of
 from slam.simulation.objects import person
@@ -61,14 +61,12 @@ class SimulatedRooms(SimulatedWorld):
             Carried(floor, "walk", seconds, options.rate, options.seed + 1000 * k)
             for k in range(1, _PEOPLE * peopled)
         ]
-        rng = np.random.default_rng([options.seed, 57])
+        rng = luck(options.seed, 57)
         # around their own origins, looking along x
         self._people = Moving(rng, [person] * _PEOPLE) if peopled else None
         fov = options.fov_deg or _USUAL_FOV_DEG
         if options.varied and options.fov_deg is None:
-            fov = float(
-                np.exp(np.random.default_rng([options.seed, 55]).uniform(*np.log(_VARIED_FOV_DEG)))
-            )
+            fov = float(np.exp(luck(options.seed, 55).uniform(*np.log(_VARIED_FOV_DEG))))
         moments = self._moments(np.arange(options.frames) / options.rate)
         camera = square_camera(options.width, options.height, fov)
         super().__init__(options, camera, self._carried.poses(moments))
@@ -148,7 +146,7 @@ class SimulatedRooms(SimulatedWorld):
         gain = self._gain(index)
         rgb = through_lens(rgb * np.float32(gain))
         if "exposure" in self.options.hazards:
-            rng = np.random.default_rng([self.options.seed, 56, index])
+            rng = luck(self.options.seed, 56, index)
             rgb = rgb + rng.standard_normal(rgb.shape, dtype=np.float32) * np.float32(
                 0.008 * np.sqrt(gain)
             )

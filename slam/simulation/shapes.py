@@ -22,6 +22,7 @@ from slam.simulation.geometry import (
     IntArray,
     Material,
     Mesh,
+    unit,
 )
 
 Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1
@@ -219,7 +220,7 @@ class Site:
         uv1, uv2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
         determinant = uv1[:, 0] * uv2[:, 1] - uv2[:, 0] * uv1[:, 1]
         tangents = (edge1 * uv2[:, 1:] - edge2 * uv1[:, 1:]) * np.sign(determinant)[:, None]
-        tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
+        tangents = unit(tangents)
         normals /= np.maximum(area, 1e-9)[:, None]
         return Mesh(
             vertices=vertices.astype(np.float32),

@@ -4,7 +4,7 @@ import numpy as np
 
 from slam.geometry import se3
 from slam.simulation import objects
-from slam.simulation.geometry import Bend, FloatArray, Material, Mesh
+from slam.simulation.geometry import Bend, FloatArray, Material, Mesh, luck
 from slam.simulation.open_land import open_land
 from slam.simulation.route import KERB, Node, StreetPlan
 from slam.simulation.shapes import Rectangle, Site, corners_of, directed, grid_over
@@ -22,8 +22,8 @@ def build_town(plan: StreetPlan, bend: Bend, seed: int, varied: bool = False) ->
         seed: of the world.
         varied: whether there are railings, posts and people as well.
     """
-    rng = np.random.default_rng([seed, 10])
-    town = _Town(plan, rng, np.random.default_rng([seed, 11]) if varied else None)
+    rng = luck(seed, 10)
+    town = _Town(plan, rng, luck(seed, 11) if varied else None)
     town.ground()
     for i in range(len(plan.xs) - 1):
         for j in range(len(plan.ys) - 1):

@@ -8,7 +8,6 @@ from itertools import product
 
 import numpy as np
 
-from slam.simulation.geometry import Material
 from slam.simulation.shapes import Site
 
 Pair = tuple[float, float]
@@ -17,15 +16,15 @@ Piece = Callable[[Site, float], None]
 
 def wood(site: Site, *door: float) -> int:
     """A wood or a painted board; ``door`` is the width and height of its doors."""
-    return site.instance(Material.WOOD, "wood", (0.75, 0.74, 0.70), door)
+    return site.instance("wood", "wood", (0.75, 0.74, 0.70), door)
 
 
 def shelf(site: Site, width: float) -> None:
     """Books to above the eyes."""
     height, tone = site.rng.uniform(1.7, 2.1), site.colour("wood")
     rows = (width, height, height / site.rng.integers(5, 8))
-    books = site.instance(Material.BOOKS, tone, 1.0, rows)
-    site.plate((0, 0, 0), (width, 0.3, height), books, site.instance(Material.WOOD, tone))
+    books = site.instance("books", tone, 1.0, rows)
+    site.plate((0, 0, 0), (width, 0.3, height), books, site.instance("wood", tone))
 
 
 def cupboard(site: Site, width: float) -> None:
@@ -45,9 +44,9 @@ def chest(site: Site, width: float) -> None:
 def desk(site: Site, width: float) -> None:
     """A table with a screen and its keyboard."""
     _table(site, width, 0.65)
-    dark = site.instance(Material.FABRIC, (0.08, 0.08, 0.09))
+    dark = site.instance("fabric", (0.08, 0.08, 0.09))
     across, high = 0.56, 0.34
-    shown = site.instance(Material.SCREEN, np.ones(3), "cloth", (across, high))
+    shown = site.instance("screen", np.ones(3), "cloth", (across, high))
     left = site.rng.uniform(0.1, max(width - across - 0.1, 0.12))
     site.plate((left, 0.15, 0.85), (across, 0.04, high), shown, dark)
     site.solid((left + 0.24, 0.14, 0.73), (0.08, 0.06, 0.14), dark)
@@ -57,11 +56,11 @@ def desk(site: Site, width: float) -> None:
 
 def counter(site: Site, width: float) -> None:
     """A kitchen's worktop with tiles above it."""
-    stone = site.instance(Material.FABRIC, "worktop")
+    stone = site.instance("fabric", "worktop")
     door = width / np.ceil(width / 0.6)
     site.solid((0, 0, 0), (width, 0.6, 0.86), wood(site, door, 0.86))
     site.solid((0, 0, 0.86), (width, 0.63, 0.04), stone)
-    tiles = site.instance(Material.TILES, "kitchen tiles", np.full(3, 0.75), (0.15, 0.008))
+    tiles = site.instance("tiles", "kitchen tiles", np.full(3, 0.75), (0.15, 0.008))
     site.plate((0, 0, 0.9), (width, 0.015, 0.6), tiles, stone)
     site.solid((0, 0, 1.5), (width, 0.33, 0.6), wood(site, door, 0.6))
     _things(site, width, 0.55, 0.9)
@@ -69,27 +68,27 @@ def counter(site: Site, width: float) -> None:
 
 def sofa(site: Site, width: float) -> None:
     """A seat, a back and two arms."""
-    cloth = site.instance(Material.FABRIC, "cloth")
+    cloth = site.instance("fabric", "cloth")
     site.solid((0, 0, 0), (width, 0.65, 0.42), cloth)
     site.solid((0, 0, 0.42), (width, 0.2, 0.4), cloth)
     for left in (0.0, width - 0.16):
         site.solid((left, 0, 0.42), (0.16, 0.65, 0.18), cloth)
-    pillow = site.instance(Material.CARPET, "paint", "paint", (0.4, 0.36, 0.11))
+    pillow = site.instance("carpet", "paint", "paint", (0.4, 0.36, 0.11))
     site.plate((0.3, 0.2, 0.43), (0.4, 0.1, 0.36), pillow, cloth)
 
 
 def bed(site: Site, width: float) -> None:
     """A bed along the wall, with a pillow and a pattern on its cover."""
-    cover = site.instance(Material.CARPET, "cloth", "paint", (width, 0.65, 0.3))
+    cover = site.instance("carpet", "cloth", "paint", (width, 0.65, 0.3))
     site.solid((0, 0, 0), (width, 0.65, 0.35), wood(site), cover)
-    pillow = site.instance(Material.FABRIC, np.full(3, 0.85))
+    pillow = site.instance("fabric", np.full(3, 0.85))
     site.solid((0.05, 0.06, 0.35), (0.45, 0.52, 0.12), pillow)
 
 
 def plant(site: Site, width: float) -> None:
     """Leaves in a pot."""
-    site.solid((0.15, 0.1, 0), (0.3, 0.3, 0.35), site.instance(Material.FABRIC, "paint"))
-    leaves = site.instance(Material.LEAVES, "house plant", 0.4)
+    site.solid((0.15, 0.1, 0), (0.3, 0.3, 0.35), site.instance("fabric", "paint"))
+    leaves = site.instance("leaves", "house plant", 0.4)
     site.ball(site.origin + (0.3, 0.28, 0.75) @ site.frame[:3], (-0.22, 0.22, 0.4), leaves)
 
 
@@ -101,7 +100,7 @@ def cartons(site: Site, width: float, depth: float = 0.6, levels: int = 3) -> No
         while width - left > 0.25:
             wide = min(rng.uniform(0.3, 0.8), width - left)
             deep = depth * rng.uniform(0.8, 1.0)
-            look = site.instance(Material.CARTON, "carton", "paint", (wide, high))
+            look = site.instance("carton", "carton", "paint", (wide, high))
             size = (wide - 0.01, deep, high * rng.uniform(0.75, 1.0))
             site.solid((left, 0, height), size, look)
             left += wide
@@ -110,7 +109,7 @@ def cartons(site: Site, width: float, depth: float = 0.6, levels: int = 3) -> No
 
 def rack(site: Site, width: float) -> None:
     """Cartons on three boards between posts."""
-    steel = site.instance(Material.METAL, "paint")
+    steel = site.instance("metal", "paint")
     _legs(site, (0.0, width - 0.06), (0.0, 0.54), (0.06, 0.06, 2.6), steel)
     for level in (0.15, 0.95, 1.75):
         site.solid((0, 0, level), (width, 0.6, 0.05), steel)
@@ -147,7 +146,7 @@ def _things(site: Site, width: float, depth: float, height: float) -> None:
     left = rng.uniform(0.05, 0.3)
     while left < width - 0.2:
         size = tuple(rng.uniform((0.06, 0.06, 0.03), (0.2, 0.2, 0.3)).tolist())
-        look = site.instance(Material.CARTON, "paint", "paint", size[::2])
+        look = site.instance("carton", "paint", "paint", size[::2])
         site.solid((left, rng.uniform(0.03, max(depth - 0.22, 0.04)), height), size, look)
         left += size[0] + rng.uniform(0.05, 0.7)
 

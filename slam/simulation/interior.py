@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.simulation.furniture import STANDING, TALL, Piece, dining
-from slam.simulation.geometry import FLAT, FloatArray, Material, luck
+from slam.simulation.geometry import FLAT, FloatArray, luck
 from slam.simulation.shapes import UP, Rectangle, Site
 
 WALL = 0.14  # thickness, metres
@@ -115,7 +115,7 @@ class Interior:
         self.house, self.site = draw_house(seed), Site(rng)
         self.obstacles: list[Rectangle] = []
         self._lights: list[tuple[float, float, float, float]] = []
-        self.frame_look = self.site.instance(Material.WOOD, "wood")
+        self.frame_look = self.site.instance("wood", "wood")
         self.skirting = self.site.colour("skirting")
         for room in self.house.rooms:
             self._enclose_and_fill(room)
@@ -129,21 +129,21 @@ class Interior:
         east, north = np.array([x1 - x0, 0.0, 0.0]), np.array([0.0, y1 - y0, 0.0])
         if room.kind in ("living", "bedroom", "office"):
             tone = site.colour("wood")
-            floor = site.instance(Material.BOARDS, tone, 1.0, (rng.uniform(0.07, 0.16),))
+            floor = site.instance("boards", tone, 1.0, (rng.uniform(0.07, 0.16),))
         else:
             side = rng.uniform(0.9, 1.3) if room.kind == "hall" else rng.uniform(0.2, 0.5)
             tone = site.colour("floor tiles")
             chequered = room.kind in ("bath", "kitchen") and rng.random() < 0.4
-            floor = site.instance(Material.TILES, tone, 0.75, (side, 0.008, chequered))
+            floor = site.instance("tiles", tone, 0.75, (side, 0.008, chequered))
         self._panel(np.array([x0, y0, 0.0]), east, north, floor)
-        ceiling = site.instance(Material.PLASTER, "ceiling")
+        ceiling = site.instance("plaster", "ceiling")
         self._panel(np.array([x0, y0, room.height]), north, east, ceiling)
         tone = site.colour("wall")
         if room.kind == "bath":
-            wall = site.instance(Material.TILES, tone, 0.8, (rng.uniform(0.1, 0.25), 0.006))
+            wall = site.instance("tiles", tone, 0.8, (rng.uniform(0.1, 0.25), 0.006))
         else:
             papered = rng.uniform(0.1, 0.3) if rng.random() < 0.2 else 0.0
-            wall = site.instance(Material.PLASTER, tone, self.skirting, (0.08, papered, 0.08))
+            wall = site.instance("plaster", tone, self.skirting, (0.08, papered, 0.08))
         for number in range(4):
             self._furnish(room, number, wall)
         self._fill_middle(room)
@@ -219,12 +219,12 @@ class Interior:
         kind = rng.random()
         if kind < 0.75:
             size = across, high, float(rng.integers(3))
-            look = place.instance(Material.PICTURE, first, second, size)
+            look = place.instance("picture", first, second, size)
         elif kind < 0.9:
-            look = place.instance(Material.SCREEN, first, second, (across, high))
+            look = place.instance("screen", first, second, (across, high))
         else:
             mirror = (0.72, 0.76, 0.78)
-            look = place.instance(Material.PANE, mirror, self.skirting, (across, high))
+            look = place.instance("pane", mirror, self.skirting, (across, high))
         left = rng.uniform(0.0, width - across)
         low = (left, 0.0, 1.6 - 0.5 * high + rng.uniform(-0.1, 0.15))
         place.plate(low, (across, 0.02, high), look, self.frame_look)
@@ -241,7 +241,7 @@ class Interior:
         place = self.site.at(x, y, angle)
         while left + width < length - 0.1:
             sky = np.array([0.86, 0.92, 0.98]) * rng.uniform(0.9, 1.05)
-            pane = place.instance(Material.PANE, sky, self.skirting, (width, high, 1.0))
+            pane = place.instance("pane", sky, self.skirting, (width, high, 1.0))
             place.plate((left, 0.0, low), (width, 0.01, high), pane, self.frame_look)
             x_light, y_light, _ = place.moved(left + 0.5 * width).moved(0.0, 0.8).origin
             strength = (0.35 if room.kind == "hall" else 0.7) * width * high
@@ -268,7 +268,7 @@ class Interior:
             size = np.minimum(free + 1.0, 2.6)
             tones = self.site.colour("cloth"), self.site.colour("paint")
             motif = rng.uniform(0.2, 0.5)
-            carpet = self.site.instance(Material.CARPET, *tones, (*size, motif))
+            carpet = self.site.instance("carpet", *tones, (*size, motif))
             corner = np.array([*(low + 0.5 * (free - size)), 0.01])
             self.site.quad(corner, np.array([size[0], 0, 0]), np.array([0, size[1], 0]), carpet)
         if free[0] > 0.8 and free[1] > 1.2 and rng.random() < 0.8:
@@ -280,7 +280,7 @@ class Interior:
     def _lamps(self, room: Room) -> None:
         """Flat lamps below the ceiling, about 3 m apart."""
         rng, (x0, y0, x1, y1) = self.rng, room.area
-        bulb = self.site.instance(Material.LAMP, (1.0, 0.98, 0.92))
+        bulb = self.site.instance("lamp", (1.0, 0.98, 0.92))
         strength = (0.8 if room.kind == "hall" else 1.0) * rng.uniform(0.8, 1.2)
         across, along = (max(1, round(extent / 3.4)) for extent in (x1 - x0, y1 - y0))
         for x in x0 + (np.arange(across) + 0.5) / across * (x1 - x0):

@@ -5,7 +5,7 @@ import functools
 import numpy as np
 
 from slam.runtime.imports import import_open3d
-from slam.simulation.geometry import Float32Array, FloatArray, IntArray, luck, unit
+from slam.simulation.geometry import MATERIALS, Float32Array, FloatArray, IntArray, luck, unit
 from slam.simulation.interior import interior_of
 from slam.simulation.room_textures import GLOWING
 from slam.simulation.world import Surface
@@ -54,7 +54,7 @@ def irradiance_of(seed: int, some_are_dim: bool) -> Float32Array:
         fade = strength * cosine[near] / (1.0 + 0.35 * distance[near] ** 2)
         direct[near] += np.where(blocked, 0.0, fade)
     hit = _around(surface, points, normal)
-    shining = np.isin(mesh.material, [int(material) for material in GLOWING])
+    shining = np.isin(mesh.material, [MATERIALS.index(material) for material in GLOWING])
     total = direct
     for _ in range(_BOUNCES):
         thrown = np.where(shining, 1.2, _ALBEDO * total[triangles].mean(axis=1))

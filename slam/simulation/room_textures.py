@@ -5,7 +5,8 @@ import numpy as np
 from slam.simulation.geometry import Material
 from slam.simulation.texture import Lengths, Shader, Texels, cell_hash, grained, mix
 
-GLOWING = {Material.SCREEN: 1.3, Material.PANE: 2.2, Material.LAMP: 2.5}  # light of their own
+# light of their own
+GLOWING: dict[Material, float] = {"screen": 1.3, "pane": 2.2, "lamp": 2.5}
 _INK = np.array([[0.12], [0.12], [0.14]], dtype=np.float32)
 
 
@@ -139,18 +140,18 @@ def _text(texels: Texels, line: Lengths | float, letter: float) -> Lengths:
 
 
 ROOM_SHADERS: dict[Material, Shader] = {
-    Material.PLASTER: _plaster,
-    Material.TILES: _tiles,
-    Material.BOARDS: _boards,
-    Material.CARPET: _carpet,
-    Material.WOOD: _wood,
-    Material.FABRIC: grained(
+    "plaster": _plaster,
+    "tiles": _tiles,
+    "boards": _boards,
+    "carpet": _carpet,
+    "wood": _wood,
+    "fabric": grained(
         (0.6, 0.6, 0.08), (0.12, 0.12, 0.07), (0.02, 0.02, 0.12), (0.008, 0.008, 0.12)
     ),
-    Material.BOOKS: _books,
-    Material.PICTURE: _picture,
-    Material.SCREEN: _screen,
-    Material.PANE: _pane,
-    Material.CARTON: _carton,
-    Material.LAMP: grained(),
+    "books": _books,
+    "picture": _picture,
+    "screen": _screen,
+    "pane": _pane,
+    "carton": _carton,
+    "lamp": grained(),
 }

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
 from slam.simulation.carried import Carried, Floor
-from slam.simulation.geometry import Float32Array, FloatArray, Material, Mesh, luck
+from slam.simulation.geometry import MATERIALS, Float32Array, FloatArray, Mesh, luck
 from slam.simulation.interior import interior_of
 from slam.simulation.irradiance import irradiance_of
 from slam.simulation.objects import person
@@ -36,7 +36,7 @@ _LONGEST_S = 0.02  # exposure in the light
 _METER_S = 0.1  # the meter's period
 _METERED = 12  # how often it is read
 _METER_WEIGHTS = np.exp(-_METER_S * np.arange(_METERED) / 0.35)  # the newest reading first
-_GLOW = np.array([GLOWING.get(material, 0.0) for material in Material], dtype=np.float32)
+_GLOW = np.array([GLOWING.get(material, 0.0) for material in MATERIALS], dtype=np.float32)
 
 
 class SimulatedRooms(SimulatedWorld):

@@ -15,6 +15,7 @@ from erfsfm.common.config_tree import parse_yaml
 from erfsfm.common.files import read_text
 from slam.simulation.geometry import (
     FLAT,
+    MATERIALS,
     PARAMETERS,
     Bend,
     Float32Array,
@@ -123,7 +124,7 @@ class Site:
             second = self.colour(second)
         elif isinstance(second, float):
             second = second * colour
-        self._looks.append((int(material), np.array([colour, second]), row))
+        self._looks.append((MATERIALS.index(material), np.array([colour, second]), row))
         return len(self._looks) - 1
 
     def patch(self, points: FloatArray, uv: FloatArray, instance: int) -> None:

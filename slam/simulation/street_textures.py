@@ -160,22 +160,22 @@ def _fence(texels: Texels) -> Lengths:
 
 
 STREET_SHADERS: dict[Material, Shader] = {
-    Material.ASPHALT: _asphalt,
-    Material.JUNCTION: _junction,
-    Material.PAVEMENT: _pavement,
-    Material.KERB: _kerb,
-    Material.GRASS: _mottled(
+    "asphalt": _asphalt,
+    "junction": _junction,
+    "pavement": _pavement,
+    "kerb": _kerb,
+    "grass": _mottled(
         (24.0, 24.0, 0.3), (8.0, 8.0, 0.35), (2.5, 2.5, 0.35), (0.7, 0.7, 0.4), (0.2, 0.2, 0.4)
     ),
-    Material.GRAVEL: _mottled((6.0, 6.0, 0.3), (1.2, 1.2, 0.3), (0.3, 0.3, 0.4), (0.1, 0.1, 0.3)),
-    Material.WALL: _wall,
-    Material.ROOF: _roof,
-    Material.BARK: _mottled((0.12, 0.6, 0.5), (0.4, 1.5, 0.4)),
-    Material.LEAVES: _mottled((1.6, 1.6, 0.4), (0.55, 0.55, 0.6), (0.2, 0.2, 0.5)),
-    Material.METAL: grained((0.5, 1.3, 0.25), (0.2, 0.4, 0.2)),
-    Material.SIGN: _sign,
-    Material.PAINT: _paint,
-    Material.GLASS: _glass,
-    Material.TYRE: _tyre,
-    Material.FENCE: _fence,
+    "gravel": _mottled((6.0, 6.0, 0.3), (1.2, 1.2, 0.3), (0.3, 0.3, 0.4), (0.1, 0.1, 0.3)),
+    "wall": _wall,
+    "roof": _roof,
+    "bark": _mottled((0.12, 0.6, 0.5), (0.4, 1.5, 0.4)),
+    "leaves": _mottled((1.6, 1.6, 0.4), (0.55, 0.55, 0.6), (0.2, 0.2, 0.5)),
+    "metal": grained((0.5, 1.3, 0.25), (0.2, 0.4, 0.2)),
+    "sign": _sign,
+    "paint": _paint,
+    "glass": _glass,
+    "tyre": _tyre,
+    "fence": _fence,
 }

@@ -4,7 +4,7 @@ import numpy as np
 
 from slam.geometry import se3
 from slam.simulation import objects
-from slam.simulation.geometry import Bend, FloatArray, Material, Mesh, luck
+from slam.simulation.geometry import Bend, FloatArray, Mesh, luck
 from slam.simulation.open_land import open_land
 from slam.simulation.route import KERB, Node, StreetPlan
 from slam.simulation.shapes import Rectangle, Site, corners_of, directed, grid_over
@@ -62,15 +62,13 @@ class _Town:
         lanes = LANE if plan.kind == "motorway" else 0.0
         smooth = 0.0 if more is None else more.uniform(0.2, 0.85)
         lines = (plan.half_width, dash, fraction, edged, lanes, smooth)
-        self.asphalt = site.instance(Material.ASPHALT, grey, paint, lines)
-        self.junction = site.instance(
-            Material.JUNCTION, grey, paint, (0.0, 0.0, 0.0, 0.0, 0.0, smooth)
-        )
+        self.asphalt = site.instance("asphalt", grey, paint, lines)
+        self.junction = site.instance("junction", grey, paint, (0.0, 0.0, 0.0, 0.0, 0.0, smooth))
         slab = (rng.uniform(0.5, 1.2),)
-        self.pavement = site.instance(Material.PAVEMENT, stone, 0.7, slab)
-        self.kerb = site.instance(Material.KERB, 1.15 * stone, 0.6 * stone)
-        self.grass = site.instance(Material.GRASS, turf, 0.55)
-        self.gravel = site.instance(Material.GRAVEL, 0.9 * stone, 0.5 * stone)
+        self.pavement = site.instance("pavement", stone, 0.7, slab)
+        self.kerb = site.instance("kerb", 1.15 * stone, 0.6 * stone)
+        self.grass = site.instance("grass", turf, 0.55)
+        self.gravel = site.instance("gravel", 0.9 * stone, 0.5 * stone)
         if self.open:
             self.pavement = self.kerb = self.grass if rng.random() < 0.6 else self.gravel
         if plan.kind == "avenue":

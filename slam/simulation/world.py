@@ -16,7 +16,7 @@ from slam.formats.ply import distances, scene_of
 from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.runtime.imports import import_open3d
-from slam.simulation.geometry import Float32Array, FloatArray, Material, Mesh
+from slam.simulation.geometry import MATERIALS, Float32Array, FloatArray, Mesh
 from slam.simulation.options import SimulationOptions
 from slam.simulation.room_textures import ROOM_SHADERS
 from slam.simulation.street_textures import STREET_SHADERS
@@ -91,7 +91,7 @@ class Hits:
                 second,
                 np.take(mesh.parameters, instance, axis=1),
             )
-            rgb[:, part] = SHADERS[Material(kind)](texels)
+            rgb[:, part] = SHADERS[MATERIALS[kind]](texels)
         return rgb
 
     def _footprint(self, pixel: Float32Array) -> tuple[Float32Array, Float32Array]:

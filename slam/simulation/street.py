@@ -52,7 +52,7 @@ class SimulatedStreet(SimulatedWorld):
     """A street world and a drive through it; the attributes are those of `SimulatedWorld`."""
 
     camera_height_m: float
-    T_camera_lidar: FloatArray
+    T_camera_lidar = T_CAMERA_LIDAR
 
     def __init__(self, options: SimulationOptions) -> None:
         """Plan the drive.
@@ -62,20 +62,18 @@ class SimulatedStreet(SimulatedWorld):
         """
         size = options.width, options.height
         still = STILL_FRAMES if "stop" in options.hazards else 0
-        variety = (
-            draw_variety(options.seed, options.route == "straight") if options.varied else None
-        )
-        camera = KITTI_CAMERA.resized(*size) if variety is None else variety.camera(*size)
+        camera, variety = KITTI_CAMERA.resized(*size), None
+        weather = draw_weather
+        if options.varied:
+            variety = draw_variety(options.seed, options.route == "straight")
+            camera, weather = variety.camera(*size), draw_varied_weather
         if options.fov_deg is not None:
             camera = square_camera(*size, options.fov_deg)
         self._route = plan_route(options.route, options.frames, options.seed, still, variety)
         super().__init__(options, camera, self._route.T_street_camera)
         self.camera_height_m = self._route.camera_height_m
-        self.T_camera_lidar = T_CAMERA_LIDAR.copy()
         self._variety = variety
-        self._weather = (
-            draw_varied_weather(options.seed) if options.varied else draw_weather(options.seed)
-        )
+        self._weather = weather(options.seed)
         rng = luck(options.seed, 31)
         # gain and gamma of every frame, piecewise constant
         exposures: list[list[float]] = []
@@ -100,7 +98,7 @@ class SimulatedStreet(SimulatedWorld):
         elevation = elevation + rng.normal(0.0, ELEVATION_NOISE, (BEAMS, COLUMNS))
         x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
         directions = np.stack([x, y, np.sin(elevation)], axis=-1).reshape(-1, 3).astype(np.float32)
-        rays = place_rays(self._T_scene_camera[index] @ self.T_camera_lidar, directions)
+        rays = place_rays(self._T_scene_camera[index] @ T_CAMERA_LIDAR, directions)
         ranges = np.full(len(rays), np.inf, dtype=np.float32)
         reflectance = np.zeros(len(rays), dtype=np.float32)
         for surface in self._surfaces(index):

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.formats.ply import distances, scene_of
+from slam.formats.ply import Ply, distances, scene_of
 from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.runtime.imports import import_open3d
@@ -196,11 +196,12 @@ class SimulatedWorld(ABC):
         points = se3.apply(self._T_scene_camera[0], np.asarray(points_world, dtype=np.float64))
         return distances(self._still.scene, points)
 
-    def mesh_world(self) -> tuple[Float32Array, NDArray[np.uint32]]:
-        """What stands still: vertices ``(V, 3)`` in the first camera, triangles ``(T, 3)``."""
-        mesh = self._still.mesh
-        vertices = se3.apply(se3.invert(self._T_scene_camera[0]), mesh.vertices.astype(np.float64))
-        return vertices.astype(np.float32), mesh.triangles
+    def mesh_world(self) -> Ply:
+        """What stands still, in the frame of the first camera."""
+        mesh, T_world_scene = self._still.mesh, se3.invert(self._T_scene_camera[0])
+        points = se3.apply(T_world_scene, mesh.vertices.astype(np.float64)).astype("<f4")
+        vertices = points.view([(axis, "<f4") for axis in "xyz"])[:, 0]
+        return Ply(vertices, mesh.triangles.astype(np.int64))
 
     def scan(self, index: int) -> Float32Array:
         """LiDAR points of a frame ``(M, 4)``: x, y, z in the LiDAR, metres, and reflectance."""

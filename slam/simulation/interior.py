@@ -189,7 +189,7 @@ class Interior:
         pieces = STANDING[room.kind]
         left = 0.7
         while True:
-            piece, width, depth = pieces[rng.integers(len(pieces))]
+            piece, width = pieces[rng.integers(len(pieces))]
             width = min(width, length - 0.05 - left)
             if width < 0.6:
                 return
@@ -201,13 +201,13 @@ class Interior:
             place = foot.moved(left, 0.01)
             stands = rng.random() < density and not (daylight and piece in TALL)
             if stands:
-                self._place(piece, place, width, depth)
+                self._place(piece, place, width)
             if not daylight and not (stands and piece in TALL) and rng.random() < 0.6:
                 self._hang(place, width)
             left += width + rng.uniform(0.05, 0.5)
 
-    def _place(self, piece: Piece, place: Site, width: float, depth: float) -> None:
-        piece(place, width)
+    def _place(self, piece: Piece, place: Site, width: float) -> None:
+        depth = piece(place, width)
         corners = np.stack([place.origin, place.moved(width).moved(0.0, depth).origin])
         self.obstacles.append((*corners.min(axis=0)[:2], *corners.max(axis=0)[:2]))
 
@@ -254,14 +254,15 @@ class Interior:
         """A table or a carpet; rows of racks in the hall."""
         rng, (x0, y0, x1, y1) = self.rng, room.area
         low = np.array([x0, y0]) + _DEEPEST + _AISLE
-        free = np.array([x1, y1]) - _DEEPEST - _AISLE - low
+        high = np.array([x1, y1]) - _DEEPEST - _AISLE
+        free = high - low
         if room.kind == "hall":
             for y in np.arange(low[1], low[1] + free[1] - 0.5, 0.6 + 1.5):
                 left = low[0]
-                while left < x1 - _DEEPEST - _AISLE - 1.0:
-                    piece, width, depth = STANDING["hall"][rng.integers(3)]
-                    width = min(width, x1 - _DEEPEST - _AISLE - left)
-                    self._place(piece, self.site.at(left, y), width, depth)
+                while left < high[0] - 1.0:
+                    piece, width = STANDING["hall"][rng.integers(3)]
+                    width = min(width, high[0] - left)
+                    self._place(piece, self.site.at(left, y), width)
                     left += width + rng.choice([0.05, 1.3], p=[0.6, 0.4])
             return
         if room.kind in ("living", "bedroom", "office") and free.min() > 0.2:

@@ -191,10 +191,9 @@ class SimulatedWorld(ABC):
         depth[depth >= FARTHEST_M] = 0.0
         return depth.reshape(self.options.height, self.options.width)
 
-    def distance_to_surface(self, points_world: NDArray[np.floating[Any]]) -> FloatArray:
+    def distance_to_surface(self, points_world: FloatArray) -> FloatArray:
         """Distance in metres from points ``(M, 3)`` to the nearest static surface, ``(M,)``."""
-        points = se3.apply(self._T_scene_camera[0], np.asarray(points_world, dtype=np.float64))
-        return distances(self._still.scene, points)
+        return distances(self._still.scene, se3.apply(self._T_scene_camera[0], points_world))
 
     def mesh_world(self) -> Ply:
         """What stands still, in the frame of the first camera."""

@@ -166,20 +166,14 @@ def test_kiss_icp_follows_the_scans(straight: SimulatedStreet) -> None:
 
 
 @pytest.mark.slow
-def test_sunny_streets_saturate_a_little_and_shadows_are_deep() -> None:
+def test_sunny_streets_saturate_a_little_and_have_slopes() -> None:
     shares, steepest = [], 0.0
     for seed in range(700, 706):
         street = SimulatedStreet(SimulationOptions("straight", 30, seed, 104, 32, varied=True))
-        weather = street._weather
-        if weather.saturated >= 0.04:
-            road_in_sun = weather.sunshine * weather.sun[2] + weather.ambient
-            assert 3.0 <= road_in_sun / weather.ambient <= 10.0 + 1e-6
-            shares.append(
-                np.mean([(street.render(index).max(axis=2) >= 254).mean() for index in (0, 15, 29)])
-            )
+        images = np.stack([street.render(index) for index in (0, 15, 29)])
+        shares.append((images.max(axis=-1) >= 254).mean())
         steepest = max(steepest, np.abs(np.diff(street.T_world_camera[:, 1, 3])).max())
-    assert len(shares) >= 3 and 0.02 < np.mean(shares) < 0.15
-    assert steepest > 0.03
+    assert 0.01 < np.mean(shares) < 0.15 and steepest > 0.03
 
 
 def test_a_bonnet_is_a_surface_before_the_camera() -> None:

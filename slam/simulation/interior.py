@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from slam.simulation.furniture import STANDING, TALL, Piece, dining
 from slam.simulation.geometry import FLAT, FloatArray, luck
-from slam.simulation.shapes import UP, Rectangle, Site
+from slam.simulation.shapes import UP, Rectangle, Site, lattice
 
 WALL = 0.14  # thickness, metres
 KINDS = ("living", "kitchen", "office", "bedroom", "bath", "office")
@@ -171,8 +171,8 @@ class Interior:
             np.linspace(0.0, 1.0, int(np.ceil(extent / _STEP)) + 1) for extent in (width, height)
         )
         points = corner + a[None, :, None] * along + b[:, None, None] * up
-        u, v = np.meshgrid(a * width, b * height + corner[2] * (up[2] > 0.0))
-        self.site.patch(points, np.stack([u, v], axis=2), look)
+        uv = lattice(a * width, b * height + corner[2] * (up[2] > 0.0))
+        self.site.patch(points, uv, look)
 
     def _furnish(self, room: Room, number: int, wall: int) -> None:
         """One wall around its doors, seen from inside, with windows, furniture and pictures."""

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 
 from slam.simulation.geometry import FloatArray
-from slam.simulation.shapes import UP, Site
+from slam.simulation.shapes import UP, Site, lattice
 
 
 def building(site: Site, width: float, depth: float) -> None:
@@ -218,8 +218,7 @@ def car(site: Site) -> None:
         ring.append([[back, -y, z], [front, -y, z], [front, y, z], [back, y, z], [back, -y, z]])
     points = np.array(ring) @ site.frame[:3] + site.origin
     corner = np.cumsum([0.0, low[1] - low[0], 2 * half, low[1] - low[0], 2 * half])
-    uv = np.stack(np.meshgrid(corner, [0.0, roof - waist]), axis=2)
-    site.patch(points, uv, glass)
+    site.patch(points, lattice(corner, (0.0, roof - waist)), glass)
     site.quad(points[1, 0], points[1, 1] - points[1, 0], points[1, 3] - points[1, 0], paint)
     angle = np.linspace(0.0, 2.0 * np.pi, 11)
     rim = np.stack([0.32 * np.cos(angle), np.zeros(11), 0.32 * np.sin(angle)], axis=1)

@@ -96,8 +96,7 @@ def hedge(site: Site, length: float) -> None:
 def lamp(site: Site, towards: FloatArray) -> None:
     """A street lamp whose arm reaches ``towards`` the road, a plan direction ``(2,)``."""
     steel = site.instance("metal", "street lamp")
-    top = site.origin + site.rng.uniform(5.0, 8.0) * UP
-    site.tube(site.origin, top, (0.10, 0.06), steel)
+    top = site.pole(site.rng.uniform(5.0, 8.0), (0.10, 0.06), steel)
     reach = np.array([*towards, 0.12])
     site.tube(top, top + reach * site.rng.uniform(0.9, 1.8), (0.05, 0.09), steel)
 
@@ -106,7 +105,7 @@ def sign(site: Site) -> None:
     """A traffic sign on a post; its plate faces traffic that drives along the place's y axis."""
     steel = site.instance("metal", "sign post")
     height = site.rng.uniform(2.1, 2.7)
-    site.tube(site.origin, site.origin + (height + 0.3) * UP, (0.04, 0.04), steel)
+    site.pole(height + 0.3, (0.04, 0.04), steel)
     paint = site.colour("sign")
     half = site.rng.uniform(0.3, 0.45)
     kind = float(site.rng.integers(3))
@@ -122,8 +121,7 @@ def railing(site: Site, length: float) -> None:
     radii = (rng.uniform(0.015, 0.05),) * 2
     posts = np.arange(0.0, length, max(spacing, length / 120))
     for along in posts.tolist():
-        foot = site.moved(along).origin
-        site.tube(foot, foot + height * UP, radii, steel)
+        site.moved(along).pole(height, radii, steel)
     for level in np.linspace(1.0, 0.25, rng.integers(1, 4)):
         bar = site.origin + level * height * UP
         site.tube(bar, bar + posts[-1] * site.frame[0] + 1e-3 * site.frame[0], radii, steel)
@@ -154,7 +152,7 @@ def barrier(site: Site, length: float, concrete: bool) -> None:
             place.box((0.0, -0.3, 0.0), (4.0, 0.3, 0.35), look)
             place.box((0.0, -0.12, 0.35), (4.0, 0.12, 0.9), look)
         else:
-            place.tube(place.origin, place.origin + 0.75 * UP, (0.06, 0.06), look)
+            place.pole(0.75, (0.06, 0.06), look)
             place.box((0.0, -0.05, 0.45), (4.0, 0.05, 0.76), look)
 
 
@@ -162,8 +160,7 @@ def post(site: Site) -> None:
     """A bollard, a guide post or a mast."""
     steel = site.instance("metal", "post")
     radius = site.rng.uniform(0.03, 0.12)
-    tip = site.origin + site.rng.choice([1.0, 3.0, 7.0]) * UP
-    site.tube(site.origin, tip, (radius, 0.8 * radius), steel)
+    site.pole(site.rng.choice([1.0, 3.0, 7.0]), (radius, 0.8 * radius), steel)
 
 
 def person(site: Site) -> None:

@@ -186,6 +186,12 @@ class Site:
         points = np.stack([base + radii[0] * ring, tip + radii[1] * ring])
         self.patch(points, lattice(angle * radii[0], (0.0, height)), instance)
 
+    def pole(self, height: float, radii: tuple[float, float], instance: int) -> FloatArray:
+        """A `tube` that stands at the place; its tip ``(3,)``."""
+        tip = self.origin + height * UP
+        self.tube(self.origin, tip, radii, instance)
+        return tip
+
     def ball(self, centre: FloatArray, radii: ArrayLike, instance: int) -> None:
         """A lumpy ellipsoid of 6 x 9 faces around a point ``(3,)``."""
         size = np.asarray(radii)

@@ -63,7 +63,7 @@ class _Town:
         smooth = 0.0 if more is None else more.uniform(0.2, 0.85)
         lines = (plan.half_width, dash, fraction, edged, lanes, smooth)
         self.asphalt = site.instance("asphalt", grey, paint, lines)
-        self.junction = site.instance("junction", grey, paint, (0.0, 0.0, 0.0, 0.0, 0.0, smooth))
+        self.junction = site.instance("junction", grey, paint, lines)
         slab = (rng.uniform(0.5, 1.2),)
         self.pavement = site.instance("pavement", stone, 0.7, slab)
         self.kerb = site.instance("kerb", 1.15 * stone, 0.6 * stone)

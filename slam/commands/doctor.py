@@ -15,6 +15,7 @@ from erfsfm.inference import record_of_whole_weights
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_open3d
 from slam.sequences.catalogue import KITTI_VARIABLE, open_sequence, sequence_kinds
+from slam.sequences.poses import poses_beside
 
 IMPORTED = {
     "numpy": "numpy",
@@ -83,7 +84,9 @@ def _weights(name: str) -> str:
 
 def _sequence(root: Path, name: str, kind: str, camera: Path | None) -> str:
     sequence = open_sequence(root, name, camera)
-    truth = "no true poses" if sequence.reference is None else "true poses"
+    truth, beside = "true poses", poses_beside(root)
+    if sequence.reference is None:
+        truth = "no true poses" + ("" if beside is None else f" (--truth {beside} gives some)")
     height = (
         f"camera {sequence.camera_height_m:.2f} m high"
         if sequence.camera_height_m

@@ -179,3 +179,13 @@ def read_truth(path: Path, stamps: FloatArray) -> FloatArray:
             f"--truth {path} covers {its} and the recording {ours}: {cure or 'bring both to the same clock'}"
         )
     return T_any_camera
+
+
+def poses_beside(recording: Path) -> Path | None:
+    """A file ``poses*.txt`` in or beside a recording; nothing tells whose poses they are."""
+    places = (
+        (recording, recording.absolute().parent)
+        if recording.is_dir()
+        else (recording.absolute().parent,)
+    )
+    return next((path for place in places for path in sorted(place.glob("poses*.txt"))), None)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from slam.commands.doctor import examine
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector
 from slam.runtime.errors import SequenceError
@@ -71,6 +72,14 @@ def test_rows_with_frame_numbers_are_of_these_frames(
     part = reference(recording, truth, "2:8")
     assert part is not None
     np.testing.assert_allclose(part, np.linalg.inv(true_poses()[2]) @ true_poses()[2:], atol=0.1)
+
+
+def test_poses_beside_a_folder_are_named_and_not_used(recording: Path) -> None:
+    beside = recording.parent / "poses.kitti.txt"
+    write_kitti(beside, Trajectory(np.arange(8.0), true_poses()))
+    assert open_sequence(recording).reference is None
+    line = examine(recording)[-1]
+    assert f"no true poses (--truth {beside} gives some)" in line
 
 
 def tum_rows() -> list[list[str]]:

@@ -121,8 +121,8 @@ def test_true_and_false_loops(
 @pytest.mark.slow
 def test_two_checkouts_in_turn(tmp_path: Path) -> None:
     report, here = tmp_path / "page.md", Path(__file__).parents[2]
-    words = ["--against", str(here), "--frames", "12", "--pairs", "1"]
-    benchmark.main(["speed", *words, "--output", str(tmp_path / "out"), "--report", str(report)])
+    words = f"speed --against {here} --frames 12 --pairs 1 --output {tmp_path / 'out'}"
+    benchmark.main([*words.split(), "--report", str(report)])
     text = report.read_text()
     table = cells(text)
     head, row = table[0], table[1]
@@ -135,18 +135,10 @@ def test_two_checkouts_in_turn(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_one_real_run_and_one_that_fails(tmp_path: Path) -> None:
-    words = ["accuracy", "--routes", "straight", "--worlds", "610", "--frames", "8", "--seeds", "0"]
-    words += [
-        "--weights",
-        "sim",
-        "nonesuch",
-        "--set",
-        "mapping.enabled=false",
-        "--output",
-        str(tmp_path / "out"),
-    ]
     report = tmp_path / "page.md"
-    benchmark.main([*words, "--report", str(report)])
+    words = "accuracy --routes straight --worlds 610 --frames 8 --seeds 0 --weights sim nonesuch"
+    words += f" --set mapping.enabled=false --output {tmp_path / 'out'} --report {report}"
+    benchmark.main(words.split())
     with (tmp_path / "out" / "accuracy.csv").open() as file:
         real, failed = csv.DictReader(file)
     assert (real["status"], real["frames"], failed["status"]) == ("ok", "8", "failed")
@@ -160,5 +152,5 @@ def test_one_real_run_and_one_that_fails(tmp_path: Path) -> None:
 
     (written,) = (tmp_path / "out" / "accuracy").glob("*/*sim*/metrics.json")
     before = written.stat().st_mtime_ns
-    benchmark.main([*words, "--report", str(report)])
+    benchmark.main(words.split())
     assert written.stat().st_mtime_ns == before

@@ -3,8 +3,6 @@
 import pytest
 import torch
 
-from erfsfm.networks.blocks import ConvBlock
-from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.lite0 import Lite0Conv
 from erfsfm.networks.presets import build
 
@@ -22,26 +20,6 @@ def test_depth_has_the_image_size_and_four_scales(name, size):
     with torch.no_grad():
         whole = network.eval()(image)
     assert whole.shape == (2, 1, *size) and (whole > 0.01).all() and (whole < 10.01).all()
-
-
-def test_the_wide_field_variant_starts_as_the_plain_one():
-    network, other = (build(name).eval() for name in DEPTH)
-    deformable = [m for m in other.modules() if isinstance(m, DeformableConv2d)]
-    assert deformable and not any(isinstance(m, DeformableConv2d) for m in network.modules())
-    state = network.state_dict()
-    for name, value in other.state_dict().items():
-        source = name.replace("kernel.weight", "weight")
-        if source in state:
-            value.copy_(state[source])
-    image = torch.rand(1, 3, 64, 96)
-    for block in network.modules():
-        if isinstance(block, ConvBlock) and block[0].bias is not None:
-            torch.nn.init.zeros_(block[0].bias)
-    for block in other.modules():
-        if isinstance(block, ConvBlock) and getattr(block[0], "bias", None) is not None:
-            torch.nn.init.zeros_(block[0].bias)
-    with torch.no_grad():
-        torch.testing.assert_close(other(image), network(image), rtol=1e-4, atol=1e-6)
 
 
 def test_imagenet_weights_keep_the_scale():

@@ -17,29 +17,6 @@ def stage_sizes(network, size):
     return [tuple(stage.shape[2:]) for stage in stages]
 
 
-@pytest.mark.parametrize("count", [1, 2, 8])
-def test_numbers_of_sources(count):
-    assert PoseNet(width=0.1, sources=count)(*images(count)).shape == (2, count, 6)
-
-
-def test_stack_is_target_first_then_sources_in_order():
-    network = PoseNet(width=0.1, sources=2)
-    seen = []
-    network.encoder.register_forward_pre_hook(lambda _, arguments: seen.append(arguments[0]))
-    target, sources = images(2)
-    network(target, sources)
-    assert torch.equal(seen[0], torch.cat([target, *sources], dim=1))
-
-
-def test_poses_are_hundredths_in_order():
-    network = PoseNet(width=0.1, sources=2)
-    torch.nn.init.zeros_(network.pose_head.weight)
-    with torch.no_grad():
-        network.pose_head.bias.copy_(torch.arange(12.0))
-    poses = network(*images(2))
-    torch.testing.assert_close(poses[0], torch.arange(12.0).view(2, 6) / 100)
-
-
 PLAIN_SIZES = [(64, 208), (32, 104), (16, 52), (8, 26), (4, 13), (2, 7), (1, 4)]
 PAPER_DILATED_SIZES = [(61, 205), (29, 101), (14, 50), (6, 24), (3, 12), (2, 6), (1, 3)]
 

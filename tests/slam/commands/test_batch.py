@@ -32,14 +32,8 @@ from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
 
 CommandLine = Callable[..., tuple[int, str, str]]
-QUICK = [
-    "--set",
-    "mapping.enabled=false",
-    "--set",
-    "visual_odometry.enabled=false",
-    "--set",
-    "output.report=false",
-]
+OFF = "mapping.enabled=false visual_odometry.enabled=false output.report=false"
+QUICK = [word for change in OFF.split() for word in ("--set", change)]
 
 UNITS_WITHOUT_METRES = ("camera heights", "the networks' own unit")
 
@@ -55,16 +49,8 @@ def test_a_manifest_names_drives(tmp_path: Path) -> None:
     )
     found = drives_of(manifest, ["all"], ["--seed", "3"])
     assert [drive.name for drive in found] == ["09", "walk", "walk-2"]
-    assert found[0].arguments == (
-        "--dataset",
-        "kitti",
-        "--sequence",
-        "09",
-        "--seed",
-        "3",
-        "--frames",
-        "0:90",
-    )
+    wanted = "--dataset kitti --sequence 09 --seed 3 --frames 0:90"
+    assert " ".join(found[0].arguments) == wanted
     assert {drive.folder for drive in found} == {tmp_path}
 
 
@@ -141,16 +127,7 @@ def test_failures_are_told_apart_and_whole_runs_are_kept(
     manifest, output = tmp_path / "drives.csv", tmp_path / "out"
     manifest.write_text(f"name,dataset\ngood,{kitti_root}\nbad,nowhere\n")
     words = [*QUICK, "--weights", str(tiny_weights), "--frames", "0:6"]
-    command = [
-        sys.executable,
-        "-m",
-        "slam",
-        "batch",
-        str(manifest),
-        "--output",
-        str(output),
-        *words,
-    ]
+    command = [sys.executable, *f"-m slam batch {manifest} --output {output}".split(), *words]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
     assert "1 of 2 drives failed" in ended.stderr and "no data set at nowhere" in ended.stdout
@@ -160,18 +137,7 @@ def test_failures_are_told_apart_and_whole_runs_are_kept(
     assert rows["bad"]["status"] == "failed" and "no data set at nowhere" in rows["bad"]["reason"]
     written = (output / "good" / "metrics.json").stat().st_mtime_ns
 
-    options = [
-        *words[:6],
-        "--weights",
-        str(tiny_weights),
-        "--frames",
-        "0:6",
-        "--seed",
-        "0",
-        "--device",
-        "auto",
-    ]
-    (good, _) = drives_of(manifest, ["all"], options)
+    (good, _) = drives_of(manifest, ["all"], [*words, *["--seed", "0", "--device", "auto"]])
     assert run_drive(good, output).status == "kept"
     assert (output / "good" / "metrics.json").stat().st_mtime_ns == written
 
@@ -209,18 +175,9 @@ def test_paths_of_the_command_line_are_seen_from_where_it_is_given(
     )
     (here / "mine.yaml").write_text(quick + "depth: {frame_stride: 3}\n")
     (data / "mine.yaml").write_text(quick + "depth: {frame_stride: 7}\n")
-    words = [
-        "batch",
-        "../data/root",
-        "--weights",
-        "mine",
-        "--config",
-        "mine.yaml",
-        "--frames",
-        "0:6",
-    ]
+    words = "batch ../data/root --weights mine --config mine.yaml --frames 0:6 --output out"
     monkeypatch.chdir(here)
-    code, out, err = command_line(main, "erfsfm-slam", *words, "--output", "out")
+    code, out, err = command_line(main, "erfsfm-slam", *words.split())
     assert code == 0, out + err
     assert "frame_stride: 3" in (here / "out/sim/config.yaml").read_text()
     with (here / "out" / "drives.csv").open() as file:

@@ -156,14 +156,8 @@ class LocalMap:
 
     def copy(self) -> LocalMap:
         """A snapshot, which stays while this map grows."""
-        own = (
-            self.keyframes.copy(),
-            self.points.copy(),
-            self.frames.copy(),
-            self.started,
-            self.turns.copy(),
-        )
-        return LocalMap(*own)
+        keyframes, frames = self.keyframes.copy(), self.frames.copy()
+        return LocalMap(keyframes, self.points.copy(), frames, self.started, self.turns.copy())
 
     @property
     def T_world_camera(self) -> FloatArray:

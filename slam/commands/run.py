@@ -22,7 +22,7 @@ from erfsfm.common.processes import limit_library_threads
 from erfsfm.common.progress import Progress, progress_bar, progress_lines, silent
 from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile
 from erfsfm.common.signals import raising_on_termination
-from erfsfm.inference import commit
+from erfsfm.inference import DepthPosePredictor, commit
 from slam.config.sections import SlamConfig, dump_yaml, load_config
 from slam.evaluation.map import double_wall_share
 from slam.formats.ply import Ply
@@ -35,8 +35,8 @@ from slam.mapping.depth import KeyframeDepth
 from slam.mapping.surface import MapSurface
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline, look_ahead, read_frame
-from slam.prediction.assembly import Prediction, open_prediction
-from slam.prediction.depth_source import FrameNumbers
+from slam.prediction.assembly import open_prediction
+from slam.prediction.depth_source import DepthSource, FrameNumbers
 from slam.results.estimate_metrics import estimate_metrics, lidar_trajectory, timing_of
 from slam.results.folder import RunFolder, RunLog, check_output, run_log
 from slam.results.metrics import MapMetrics, Metrics, Provenance
@@ -338,21 +338,23 @@ def perform(request: RunRequest) -> RunFolder:
         # by which files of depth are found
         numbers = FrameNumbers(len(recording), recording.start, recording.recorded)
         undistort = None if lens is None else lens.apply_to_depth
-        prediction = open_prediction(
+        predictor, networks, source = open_prediction(
             request.weights, request.device, settings.depth, camera, numbers, undistort
         )
         track = None if request.gps is None else read_gps(request.gps)
         progress = request.progress
-        pipeline = SlamPipeline(
-            recording, prediction.predictor, settings, progress, request.seed, track
-        )
+        pipeline = SlamPipeline(recording, predictor, settings, progress, request.seed, track)
         pipeline.require_possible()
         folder = RunFolder.create(request.output, Path(settings.output.root), recording.name, lock)
         if isinstance(recording.camera, CameraFile) and recording.camera.fx_sigma:
             keys = recording.camera.model_dump(mode="json")
             folder.write(CAMERA_FILE, yaml.safe_dump(keys, sort_keys=False, width=1000))
         recorder = FolderRecorder(
-            folder, pipeline, settings, provenance_of(request, prediction, recording), progress
+            folder,
+            pipeline,
+            settings,
+            provenance_of(request, recording, networks, source),
+            progress,
         )
         estimate = record(recorder, log, ignore_signals)
         if request.rerun is not None:
@@ -416,9 +418,13 @@ def record(
         raise
 
 
-def provenance_of(request: Request, prediction: Prediction, recording: FrameSequence) -> Provenance:
-    """The input of a run: networks, depth, and the options that name the recording."""
-    networks, source = prediction.networks, prediction.source
+def provenance_of(
+    request: Request,
+    recording: FrameSequence,
+    networks: DepthPosePredictor,
+    source: DepthSource | None,
+) -> Provenance:
+    """The input of a run: networks, another source of depth, and the options that name the recording."""
     # else a shipped name, whatever lies here
     is_folder = Path(request.weights) == Path(networks.origin)
     return Provenance(

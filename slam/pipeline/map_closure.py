@@ -6,20 +6,20 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
-from slam.frames import KEYFRAME_SOURCE, Intrinsics, RelativePose, TrackingEvent, View
-from slam.frontend.factors import scaled_poses
+from slam.frames import KEYFRAME_SOURCE, Ends, Intrinsics, RelativePose, TrackingEvent, View
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.frontend.keyframes.submaps import join
 from slam.frontend.scale import Scale
 from slam.geometry.se3 import FloatArray, invert, make, path_distance
-from slam.graph.pose_graph import RelativeSimilarity, optimise_similarities
+from slam.graph.pose_graph import optimise_similarities
 from slam.loops.closure import LoopClosures, Track, find_loops, most_inliers_first
 from slam.loops.verification import OF_KEYFRAMES, Loop, LoopVerifier
 
@@ -51,10 +51,9 @@ class MapClosure:
 
     def closures(self, scale: Scale) -> LoopClosures:
         """The loops in the unit of the scale, the accepted ones by the relative poses of the closed maps."""
-        scaled = scaled_poses(self.poses.loops, self.poses, scale)
         accepted = [
-            replace(loop, measured=pose)
-            for pose, loop in zip(scaled, self.loops.accepted, strict=True)
+            replace(loop, measured=scale.scaled(pose))
+            for pose, loop in zip(self.poses.loops, self.loops.accepted, strict=True)
         ]
         return replace(self.loops, accepted=tuple(accepted))
 
@@ -111,28 +110,27 @@ class _Rows:
         T_world_camera = np.array(T)
         path = path_distance(T_world_camera) + _UNRELATED * np.array(worlds)
         self.track = Track(T_world_camera, path, frames, self.maps)
-        self._links: list[Loop] = []
-        for last in np.flatnonzero(np.diff(self.maps)).tolist():
-            if worlds[last] == worlds[last + 1]:
-                self._links.append(self._link(poses, last))
-
-    def _link(self, poses: KeyframePoses, last: int) -> Loop:
-        """The motion from the ``last`` keyframe of a map to the next map, whose unit learned depth alone knows."""
-        first, final = self.track.frames[last : last + 2].tolist()
-        T_last_first = invert(self.track.T_world_camera[last]) @ self.track.T_world_camera[last + 1]
-        turns = [pose for pose in poses.poses if first <= pose.ends[0] and pose.ends[1] <= final]
-        sigmas = np.linalg.norm([turn.sigmas for turn in turns], axis=0)
-        measured = RelativePose(first, final, T_last_first, sigmas, KEYFRAME_SOURCE)
-        own, other = self.maps[last : last + 2].tolist()
-        return Loop(measured, 0, 0.0, poses.learned_units[other] / poses.learned_units[own])
+        self._worlds, self._poses = worlds, poses.poses
 
     def links(self, loops: Sequence[Loop]) -> list[Loop]:
-        """Motions from one map to the next where both have loops, which know better how far both are apart."""
-        closed, kept = self.maps[self.track.rows(loops)], []
-        for link in self._links:
-            if np.isin(self.maps[self.track.rows([link])], closed).all():
-                kept.append(link)
-        return kept
+        """Motions from one map to the next where both have loops, which know better how far both are apart.
+
+        The units of both are that of learned depth.
+        """
+        links, closed, T = [], self.maps[self.track.rows(loops)], self.track.T_world_camera
+        for last in np.flatnonzero(np.diff(self.maps)).tolist():
+            ends = slice(last, last + 2)
+            if np.isin(self.maps[ends], closed).all() and len(set(self._worlds[ends])) == 1:
+                first, final = self.track.frames[ends].tolist()
+                between = []
+                for pose in self._poses:
+                    if first <= pose.from_index and pose.to_index <= final:
+                        between.append(pose.sigmas)
+                sigmas = np.linalg.norm(between, axis=0)
+                T_last_next = invert(T[last]) @ T[last + 1]
+                pose = RelativePose(first, final, T_last_next, sigmas, KEYFRAME_SOURCE)
+                links.append(Loop(pose, 0, 0.0))
+        return links
 
     def views(self) -> list[View]:
         """Corners with their points in the camera where these have parallax: others would give a loop a wrong scale."""
@@ -201,30 +199,30 @@ def _joined(
             if rows.maps[row] == rows.maps[chosen[last]]:
                 T_step = invert(rows.T_map_camera[row]) @ rows.T_map_camera[chosen[last]]
                 length = _RELATIVE_SIGMA * float(np.linalg.norm(T_step[:3, 3])) + _LEAST_SIGMA
-                sigmas = np.concatenate(
-                    [np.full(3, _ROTATION_SIGMA), np.full(3, length), [_SCALE_SIGMA]]
-                )
-                edges.append(RelativeSimilarity(first, last, T_step, 1.0, sigmas))
+                sigmas = np.repeat([_ROTATION_SIGMA, length], 3)
+                pose = RelativePose(first, last, T_step, sigmas, KEYFRAME_SOURCE)
+                edges.append((pose, 1.0, _SCALE_SIGMA))
     for loop, (earlier, later) in zip(loops, place[rows.track.rows(loops)].tolist(), strict=True):
+        pose = replace(loop.measured, from_index=earlier, to_index=later)
         scale_sigma = _LOOP_SCALE_SIGMA if loop.inliers else _LINK_SCALE_SIGMA
-        sigmas = np.append(loop.measured.sigmas, scale_sigma)
-        edges.append(
-            RelativeSimilarity(earlier, later, loop.measured.T_from_to, loop.scale, sigmas)
-        )
+        edges.append((pose, loop.scale, scale_sigma))
         if loop.inliers:
             shared.append((earlier, later, loop.corners))
     T, scales = optimise_similarities(*_start(len(chosen), edges), edges)
     return join([rows.segments[member] for member in members], T, scales, shared, intrinsics)
 
 
-def _start(count: int, edges: Sequence[RelativeSimilarity]) -> tuple[FloatArray, FloatArray]:
+def _start(
+    count: int, edges: Sequence[tuple[RelativePose, float, float]]
+) -> tuple[FloatArray, FloatArray]:
     """Poses ``(K, 4, 4)`` and units ``(K,)`` of cameras in the first one, by the surest edges that lead there."""
-    sigmas, steps = np.zeros((count, count)), {}
-    for edge in edges:
-        ends, step = (edge.from_index, edge.to_index), edge.T_from_to.copy()
-        step[:3, :3] *= edge.scale
-        steps[ends], steps[ends[::-1]] = step, np.linalg.inv(step)
-        sigmas[ends] = np.linalg.norm(edge.sigmas[[0, 1, 2, 6]])
+    sigmas = np.zeros((count, count))
+    steps: dict[Ends, NDArray[np.floating[Any]]] = {}
+    for pose, scale, scale_sigma in edges:
+        step = pose.T_from_to.copy()
+        step[:3, :3] *= scale
+        steps[pose.ends], steps[pose.ends[::-1]] = step, np.linalg.inv(step)
+        sigmas[pose.ends] = scale_sigma + pose.sigmas[:3].sum()
     order, before = breadth_first_order(minimum_spanning_tree(sigmas), 0, directed=False)
     similar = np.tile(np.eye(4), (count, 1, 1))
     for row in order[1:].tolist():

@@ -47,7 +47,7 @@ class SimulatedSequence(RecordedSequence):
 
     def __init__(self, options: SimulationOptions) -> None:
         street = self.street = simulated_world(options)
-        rendered = lru_cache(maxsize=_CACHED_FRAMES)(lambda index: street.render(index).image)
+        rendered = lru_cache(maxsize=_CACHED_FRAMES)(lambda index: street.render(index))
         super().__init__(
             "sim",
             ReadImages(
@@ -150,10 +150,9 @@ def _write_frames(
     for name in ["image_2"] + ["depth_2"] * depth + ["velodyne"] * lidar:
         (folder / name).mkdir(parents=True)
     for index in range(len(world)):
-        frame = world.render(index)
-        write_image(folder / "image_2" / f"{index:06d}.png", frame.image)
+        write_image(folder / "image_2" / f"{index:06d}.png", world.render(index))
         if depth:
-            units = np.clip(np.rint(frame.depth * 256.0), 0.0, 65535.0)
+            units = np.clip(np.rint(world.depth(index) * 256.0), 0.0, 65535.0)
             _write_png(folder / "depth_2" / f"{index:06d}.png", units.astype(np.uint16))
         if lidar:
             world.scan(index).astype("<f4").tofile(folder / "velodyne" / f"{index:06d}.bin")

@@ -196,7 +196,6 @@ def test_corners_are_tracked_through_the_images(
     points, images = rows(model / "points3D.txt"), rows(model / "images.txt")
     assert len(points) > 100 and len(images) == 2 * FRAMES
     X: FloatArray = np.array([point[1:4] for point in points], float)
-    assert street.reference is not None
     seen = 0
     for k, point in enumerate(points):
         for image, corner in zip(map(int, point[8::2]), map(int, point[9::2]), strict=True):
@@ -304,7 +303,6 @@ def test_interpolated_frames_are_no_images_of_a_colmap_model(
 def test_a_run_of_a_part_finds_its_frames(make_recorded: MakeRecorded, tmp_path: Path) -> None:
     folder = make_recorded()
     trajectory = folder.trajectory("optimised")
-    assert trajectory is not None
     folder.write_trajectory(
         "optimised", Trajectory(trajectory.stamps[3:6], trajectory.T_world_camera[3:6], True)
     )
@@ -332,7 +330,6 @@ def test_images_that_have_gone_are_one_line_and_a_new_place_is_taken(
     written = export(folder, "nerfstudio", tmp_path / "scene", "z", dataset=tmp_path / "elsewhere")
     assert len(scene(written)["frames"]) == 8
     trajectory = folder.trajectory("optimised")
-    assert trajectory is not None
     folder.write_trajectory(
         "optimised", Trajectory(trajectory.stamps + 100, trajectory.T_world_camera, True)
     )

@@ -21,7 +21,7 @@ SEED = 700
 @functools.cache
 def street() -> list[Grey]:
     drive = SimulatedStreet(SimulationOptions("straight", FRAMES, SEED, WIDTH, HEIGHT))
-    return [cv2.cvtColor(drive.render(k).image, cv2.COLOR_RGB2GRAY) for k in range(FRAMES)]
+    return [cv2.cvtColor(drive.render(k), cv2.COLOR_RGB2GRAY) for k in range(FRAMES)]
 
 
 def with_bonnet(grey: Grey) -> Grey:

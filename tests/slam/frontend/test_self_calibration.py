@@ -21,7 +21,7 @@ STREET = SimulationOptions(route="loop", frames=250, seed=11, width=WIDTH, heigh
 def images(options: SimulationOptions, first: int, last: int) -> Iterator[Frame]:
     street = simulated_world(options)
     for index in range(first, last):
-        yield Frame(index, index / 10, street.render(index).image)
+        yield Frame(index, index / 10, street.render(index))
 
 
 def test_a_street_that_turns_shows_its_focal_length() -> None:

@@ -57,12 +57,12 @@ class LoopClosures:
     def without(self, dropped: Sequence[RelativePose]) -> LoopClosures:
         """The same after the pose graph dropped some accepted loops."""
         ends = {edge.ends for edge in dropped}
-        kept, gone = [], []
-        for loop in self.accepted:
-            if loop.ends in ends:
-                gone.append(loop.refused("contradicts the pose graph"))
-            else:
-                kept.append(loop)
+        kept = [loop for loop in self.accepted if loop.ends not in ends]
+        gone = [
+            loop.refused("contradicts the pose graph")
+            for loop in self.accepted
+            if loop.ends in ends
+        ]
         return replace(self, accepted=tuple(kept), rejected=(*gone, *self.rejected))
 
     def details(self) -> dict[str, Any]:
@@ -79,12 +79,11 @@ class LoopClosures:
 
         accepted = []
         for loop in self.accepted:
-            reason, measured = f"{loop.inliers} inliers in both directions", loop.measured
-            measurement = {
-                "T_from_to": measured.T_from_to.tolist(),
-                "sigmas": measured.sigmas.tolist(),
-            }
-            accepted.append(entry(loop.ends, loop, reason=reason, **measurement))
+            reason = f"{loop.inliers} inliers in both directions"
+            T_from_to, sigmas = loop.measured.T_from_to.tolist(), loop.measured.sigmas.tolist()
+            accepted.append(
+                entry(loop.ends, loop, reason=reason, T_from_to=T_from_to, sigmas=sigmas)
+            )
         rejected = [
             entry((loop.from_index, loop.to_index), loop, reason=loop.reason)
             for loop in self.rejected
@@ -153,13 +152,8 @@ def find_loops(
     tried += verdicts(
         c for c in candidates if c.rank >= _TRIED_FIRST and views[c.later].index in seen_again
     )
-    verified: list[Loop] = []
-    refused: list[RejectedLoop] = []
-    for verdict in tried:
-        if isinstance(verdict, Loop):
-            verified.append(verdict)
-        else:
-            refused.append(verdict)
+    verified = [verdict for verdict in tried if isinstance(verdict, Loop)]
+    refused = [verdict for verdict in tried if isinstance(verdict, RejectedLoop)]
     accepted, rejected = agreeing(verified, track, verifier.thresholds)
     rejected += refused
     logger.info(

@@ -6,13 +6,14 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
-from slam.frames import KEYFRAME_SOURCE, Intrinsics, RelativePose, TrackingEvent, View
+from slam.frames import KEYFRAME_SOURCE, Ends, Intrinsics, RelativePose, TrackingEvent, View
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.frontend.keyframes.submaps import join
@@ -33,7 +34,8 @@ _LEAST_KEPT = 0.5
 _ROTATION_SIGMA, _RELATIVE_SIGMA, _SCALE_SIGMA = 0.005, 0.03, 0.02
 _LEAST_SIGMA = 1e-4
 _UNRELATED = 1e9  # length by which odometry may err between maps that no motion relates
-_LOOP_SCALE_SIGMA = 0.05  # of the logarithm of the ratio of two units by a loop
+# of the logarithm of the ratio of two units by a loop, and by learned depth
+_LOOP_SCALE_SIGMA, _LINK_SCALE_SIGMA = 0.05, 0.3
 
 
 @dataclass(frozen=True)
@@ -108,15 +110,27 @@ class _Rows:
         T_world_camera = np.array(T)
         path = path_distance(T_world_camera) + _UNRELATED * np.array(worlds)
         self.track = Track(T_world_camera, path, frames, self.maps)
+        self._worlds, self._poses = worlds, poses.poses
 
-    def of(self, loop: Loop) -> tuple[int, int]:
-        """Rows of the keyframes of a loop."""
-        earlier, later = self.track.rows([loop])[0].tolist()
-        return earlier, later
+    def links(self, loops: Sequence[Loop]) -> list[Loop]:
+        """Motions from one map to the next where both have loops, which know better how far both are apart.
 
-    def _maps_of(self, loop: Loop) -> set[int]:
-        """Numbers of the maps of its keyframes, of which there may be one."""
-        return set(self.maps[list(self.of(loop))].tolist())
+        The units of both are that of learned depth.
+        """
+        links, closed, T = [], self.maps[self.track.rows(loops)], self.track.T_world_camera
+        for last in np.flatnonzero(np.diff(self.maps)).tolist():
+            ends = slice(last, last + 2)
+            if np.isin(self.maps[ends], closed).all() and len(set(self._worlds[ends])) == 1:
+                first, final = self.track.frames[ends].tolist()
+                between = []
+                for pose in self._poses:
+                    if first <= pose.from_index and pose.to_index <= final:
+                        between.append(pose.sigmas)
+                sigmas = np.linalg.norm(between, axis=0)
+                T_last_next = invert(T[last]) @ T[last + 1]
+                pose = RelativePose(first, final, T_last_next, sigmas, KEYFRAME_SOURCE)
+                links.append(Loop(pose, 0, 0.0))
+        return links
 
     def views(self) -> list[View]:
         """Corners with their points in the camera where these have parallax: others would give a loop a wrong scale."""
@@ -139,61 +153,33 @@ class _Rows:
 
     def joins(self, loops: Sequence[Loop]) -> tuple[TrackingEvent, ...]:
         """Each map after the first that loops join with an earlier one."""
-        events = []
+        events, pairs = [], self.maps[self.track.rows(loops)]
         for number, segment in enumerate(self.segments):
-            joining = [
-                self.keyframes[earlier].index
-                for earlier, later in map(self.of, loops)
-                if self.maps[earlier] != number and self.maps[later] == number
-            ]
-            if joining:
-                first = segment.keyframes[0].index
-                events.append(TrackingEvent(first, "map joined", joining[0], len(joining)))
+            joining = np.flatnonzero((pairs[:, 0] != number) & (pairs[:, 1] == number))
+            if len(joining):
+                first, other = segment.keyframes[0].index, loops[joining[0]].ends[0]
+                events.append(TrackingEvent(first, "map joined", other, len(joining)))
         return tuple(events)
-
-    def start(
-        self, loops: Sequence[Loop], members: NDArray[np.intp]
-    ) -> tuple[FloatArray, FloatArray]:
-        """Poses ``(K, 4, 4)`` and units ``(K,)`` of all keyframes in the world of the first of some joined maps."""
-        T, scales = self.T_map_camera.copy(), np.ones(len(self.keyframes))
-        done = {int(members[0])}
-        across = [loop for loop in loops if len(self._maps_of(loop)) == 2]
-        across.sort(key=lambda loop: -loop.inliers)
-        while len(done) < len(members):
-            loop = next(loop for loop in across if len(done & self._maps_of(loop)) == 1)
-            known, new = self.of(loop)
-            T_known_new, scale = loop.measured.T_from_to, loop.scale
-            if int(self.maps[known]) not in done:
-                known, new = new, known
-                T_known_new, scale = invert(T_known_new), 1.0 / scale
-                T_known_new[:3, 3] *= scale
-            number = int(self.maps[new])
-            scales[self.maps == number] = scale * scales[known]
-            T_step = make(T_known_new[:3, :3], scales[known] * T_known_new[:3, 3])
-            T_new_member = invert(self.T_map_camera[new]) @ self.T_map_camera[self.maps == number]
-            T_new_member[:, :3, 3] *= scales[new]
-            T[self.maps == number] = T[known] @ T_step @ T_new_member
-            done.add(number)
-        return T, scales
 
 
 def _closed(
     rows: _Rows, loops: Sequence[Loop], intrinsics: Intrinsics
 ) -> tuple[list[LocalMap], list[Loop]]:
     """The maps after these loops, and the loops that the adjustment contradicts."""
-    count, ends = len(rows.segments), rows.maps[rows.track.rows(loops)]
-    links = csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
-    _, group = connected_components(links, directed=False)
+    across, count = [*loops, *rows.links(loops)], len(rows.segments)
+    one, other = rows.maps[rows.track.rows(across)].T
+    joining = csr_array((np.ones(len(one)), (one, other)), shape=(count, count))
+    _, group = connected_components(joining, directed=False)
     closed, wrong = [], []
     for number in np.unique(group):
         members = np.flatnonzero(group == number)
-        inside = list(compress(loops, group[ends[:, 0]] == number))
+        inside = list(compress(across, group[one] == number))
         if not inside:
             closed += [rows.segments[member] for member in members]
             continue
         joined, kept = _joined(rows, inside, members, intrinsics)
         closed.append(joined)
-        for loop, ratio in zip(inside, kept, strict=True):
+        for loop, ratio in zip(inside, kept, strict=False):
             if ratio < _LEAST_KEPT:
                 wrong.append(loop)
     return closed, wrong
@@ -202,7 +188,7 @@ def _closed(
 def _joined(
     rows: _Rows, loops: Sequence[Loop], members: NDArray[np.intp], intrinsics: Intrinsics
 ) -> tuple[LocalMap, list[float]]:
-    T, scales = rows.start(loops, members)
+    """One map by loops and, after these, links; the ratio of each loop's corners that are still one point."""
     chosen = np.flatnonzero(np.isin(rows.maps, members))
     place = np.full(len(rows.keyframes), -1)
     place[chosen] = np.arange(len(chosen))
@@ -218,7 +204,28 @@ def _joined(
                 edges.append((pose, 1.0, _SCALE_SIGMA))
     for loop, (earlier, later) in zip(loops, place[rows.track.rows(loops)].tolist(), strict=True):
         pose = replace(loop.measured, from_index=earlier, to_index=later)
-        edges.append((pose, loop.scale, _LOOP_SCALE_SIGMA))
-        shared.append((earlier, later, loop.corners))
-    T, scales = optimise_similarities(T[chosen], scales[chosen], edges)
+        scale_sigma = _LOOP_SCALE_SIGMA if loop.inliers else _LINK_SCALE_SIGMA
+        edges.append((pose, loop.scale, scale_sigma))
+        if loop.inliers:
+            shared.append((earlier, later, loop.corners))
+    T, scales = optimise_similarities(*_start(len(chosen), edges), edges)
     return join([rows.segments[member] for member in members], T, scales, shared, intrinsics)
+
+
+def _start(
+    count: int, edges: Sequence[tuple[RelativePose, float, float]]
+) -> tuple[FloatArray, FloatArray]:
+    """Poses ``(K, 4, 4)`` and units ``(K,)`` of cameras in the first one, by the surest edges that lead there."""
+    sigmas = np.zeros((count, count))
+    steps: dict[Ends, NDArray[np.floating[Any]]] = {}
+    for pose, scale, scale_sigma in edges:
+        step = pose.T_from_to.copy()
+        step[:3, :3] *= scale
+        steps[pose.ends], steps[pose.ends[::-1]] = step, np.linalg.inv(step)
+        sigmas[pose.ends] = scale_sigma + pose.sigmas[:3].sum()
+    order, before = breadth_first_order(minimum_spanning_tree(sigmas), 0, directed=False)
+    similar = np.tile(np.eye(4), (count, 1, 1))
+    for row in order[1:].tolist():
+        similar[row] = similar[before[row]] @ steps[int(before[row]), row]
+    scales = np.cbrt(np.linalg.det(similar[:, :3, :3]))
+    return make(similar[:, :3, :3] / scales[:, None, None], similar[:, :3, 3]), scales

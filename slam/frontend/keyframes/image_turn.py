@@ -28,6 +28,7 @@ _LEAST_CONTRAST = 3.0  # grey levels, of noise
 _OUTLIER = 0.7  # residual of local contrast at which a pixel counts half
 _ITERATIONS, _CONVERGED = 10, 1e-4
 _LEAST_PIXELS = 200
+_CLEAR = 0.8  # correlation of turned images from which on no other guess is tried
 _LEAST_CORNERS, _SHUTTER_ITERATIONS = 20, 3  # by which a rolling shutter's turn is measured
 
 SmallImage = NDArray[np.float32]
@@ -86,12 +87,12 @@ def image_turn(
     turns = [ImageTurn(guess) for guess in (R_guess, R_shift, np.eye(3))]
     for first, second, size_ratio in pairs:
         problem = _Alignment(first, second, intrinsics, size_ratio)
-        turns = [
-            max(
-                (problem.solve(turn.R_now_before) for turn in turns),
-                key=lambda turn: turn.correlation,
-            )
-        ]
+        solved: list[ImageTurn] = []
+        for turn in turns:
+            solved.append(problem.solve(turn.R_now_before))
+            if solved[-1].correlation > _CLEAR:
+                break
+        turns = [max(solved, key=lambda turn: turn.correlation)]
     return turns[0]
 
 

@@ -156,14 +156,8 @@ class LocalMap:
 
     def copy(self) -> LocalMap:
         """A snapshot, which stays while this map grows."""
-        own = (
-            self.keyframes.copy(),
-            self.points.copy(),
-            self.frames.copy(),
-            self.started,
-            self.turns.copy(),
-        )
-        return LocalMap(*own)
+        keyframes, frames = self.keyframes.copy(), self.frames.copy()
+        return LocalMap(keyframes, self.points.copy(), frames, self.started, self.turns.copy())
 
     @property
     def T_world_camera(self) -> FloatArray:
@@ -208,21 +202,29 @@ class LocalMap:
             )
         return parallax
 
-    def add_points(self, intrinsics: Intrinsics) -> None:
-        """Points of the newest keyframe's tracks that have none, at learned depth in the unit of the map."""
+    def add_points(self, intrinsics: Intrinsics) -> Parallax:
+        """Points of the newest keyframe's tracks that have none, at learned depth in the unit of the map.
+
+        Returns:
+            Parallax of all points between the last keyframes.
+        """
         newest = self.keyframes[-1]
         tracks, learned = newest.track_ids, newest.learned_depth
         ratios = self.ratios(newest)
         both, new = ratios > 0.0, ~self.known(tracks) & (learned > 0.0)
-        by_rays = self.parallax(self.keyframes[-_LOOKED_BACK:]).by_rays(PIXEL_SIGMA / intrinsics.fx)
-        weights = 1.0 / (DEPTH_SIGMA**2 + by_rays[tracks[both]] ** 2)
+        parallax = self.parallax(self.keyframes[-_LOOKED_BACK:])
+        by_rays = parallax.by_rays(PIXEL_SIGMA / intrinsics.fx)[tracks[both]]
+        weights = 1.0 / (DEPTH_SIGMA**2 + by_rays**2)
         unit = weighted_median(ratios[both], weights) if both.sum() >= _LEAST_RATIOS else 1.0
         rays = intrinsics.rays(newest.pixels[new]) * (unit * learned[new, None])
         self.points[tracks[new]] = apply(invert(newest.T_camera_world), rays)
+        parallax.see(newest.T_camera_world, tracks[new])
+        return parallax
 
-    def spread(self, intrinsics: Intrinsics) -> FloatArray:
+    def spread(self, intrinsics: Intrinsics, parallax: Parallax | None = None) -> FloatArray:
         """One sigma of the newest keyframe's points ``(M, 3)``, along the ray on which each was seen first."""
-        spread = self.parallax(self.keyframes[-_LOOKED_BACK:]).spread(PIXEL_SIGMA / intrinsics.fx)
+        parallax = parallax or self.parallax(self.keyframes[-_LOOKED_BACK:])
+        spread = parallax.spread(PIXEL_SIGMA / intrinsics.fx)
         return np.nan_to_num(spread[self.keyframes[-1].track_ids])
 
     def adjust(self, intrinsics: Intrinsics) -> TrackIds:

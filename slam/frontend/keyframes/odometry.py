@@ -193,8 +193,8 @@ class KeyframeOdometry:
         if segment.keyframes[-1].index != frame.index:
             return
         segment.keyframes[-1] = segment.keyframes[-1].with_depth(depth)
-        segment.add_points(self._intrinsics)
-        self._spread = None
+        parallax = segment.add_points(self._intrinsics)
+        self._spread = segment.spread(self._intrinsics, parallax)
         points = int(segment.known(segment.keyframes[-1].track_ids).sum())
         if not segment.started and points >= MIN_POINTS:
             segment.started = True

@@ -29,7 +29,6 @@ class Relocaliser:
         self.local = local
         self._intrinsics = intrinsics
         self._views = local.views(local.points)
-        self._T_map_camera = local.T_world_camera
         self._index = PlaceIndex(self._views)
         self._verifier = LoopVerifier(OF_KEYFRAMES, intrinsics, seed=seed)
 
@@ -40,12 +39,12 @@ class Relocaliser:
             ``T_camera_map``, the tracks ``(M,)`` of these points, each once, the pixels ``(M, 2)``
             where the image sees them, and the frame of the keyframe with most of them.
         """
-        keyframes, rows, points = self._matched(image)
+        keyframes, tracks, rows = self._matched(image)
+        points, pixels = self.local.points[tracks], image.pixels[rows]
         located: list[Sighting] = []
         for keyframe in np.unique(keyframes):
             here = keyframes == keyframe
-            pixels = image.pixels[rows[here, 1]]
-            seen = self._verifier.resect(points[here].astype(np.float32), pixels)
+            seen = self._verifier.resect(points[here].astype(np.float32), pixels[here])
             if not isinstance(seen, str):
                 located.append(seen)
         if not located:
@@ -54,36 +53,28 @@ class Relocaliser:
         X = apply(best.T_camera_points, points)
         ahead = X[:, 2] > 0
         X[~ahead, 2] = 1.0
-        residual = np.linalg.norm(self._intrinsics.project(X) - image.pixels[rows[:, 1]], axis=1)
+        residual = np.linalg.norm(self._intrinsics.project(X) - pixels, axis=1)
         kept = np.flatnonzero(ahead & (residual < OF_KEYFRAMES.reprojection_px))
-        _, first = np.unique(rows[kept, 1], return_index=True)
-        kept = kept[first]
+        for once in (rows, tracks):  # each corner and each point
+            kept = kept[np.unique(once[kept], return_index=True)[1]]
         if len(kept) < _LEAST_CONFIRMING:
             return None
-        tracks = np.empty(len(kept), np.int64)
-        for keyframe in np.unique(keyframes[kept]):
-            here = keyframes[kept] == keyframe
-            tracks[here] = self.local.keyframes[keyframe].track_ids[rows[kept[here], 0]]
-        tracks, once = np.unique(tracks, return_index=True)
         place = self.local.keyframes[int(np.bincount(keyframes[kept]).argmax())].index
-        return best.T_camera_points, tracks, image.pixels[rows[kept[once], 1]], place
+        return best.T_camera_points, tracks[kept], pixels[kept], place
 
-    def _matched(self, image: View) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
+    def _matched(self, image: View) -> tuple[NDArray[np.intp], NDArray[np.int64], NDArray[np.intp]]:
         """Corners of similar keyframes that match those of the image and have points.
 
         Returns:
-            Rows of the keyframes ``(M,)``, rows of their corners and of the image's ``(M, 2)``, and
-            the points in the map ``(M, 3)``.
+            Rows of the keyframes ``(M,)``, tracks of their corners, and rows of the image's.
         """
-        keyframes = [np.zeros(0, np.intp)]
-        rows = [np.zeros((0, 2), np.intp)]
-        points = [np.zeros((0, 3))]
+        keyframes, tracks = [np.zeros(0, np.intp)], [np.zeros(0, np.int64)]
+        rows = [np.zeros(0, np.intp)]
         for keyframe in self._index.nearest(image, _PLACES_TRIED):
-            view = self._views[keyframe]
-            pairs = np.column_stack(matches(view, image, OF_KEYFRAMES))
-            pairs = pairs[np.isfinite(view.points[pairs[:, 0]]).all(axis=1)]
-            seen = view.points[pairs[:, 0]].astype(np.float64)
-            keyframes.append(np.full(len(pairs), keyframe))
-            rows.append(pairs)
-            points.append(apply(self._T_map_camera[keyframe], seen))
-        return np.concatenate(keyframes), np.concatenate(rows), np.concatenate(points)
+            corners, corners_image = matches(self._views[keyframe], image, OF_KEYFRAMES)
+            own = self.local.keyframes[keyframe].track_ids[corners]
+            known = self.local.known(own)
+            keyframes.append(np.full(int(known.sum()), keyframe))
+            tracks.append(own[known])
+            rows.append(corners_image[known])
+        return np.concatenate(keyframes), np.concatenate(tracks), np.concatenate(rows)

@@ -1,5 +1,4 @@
 import functools
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,11 +7,12 @@ import numpy as np
 import pytest
 import room
 
-from slam.frames import LOOP_SOURCE, RelativePose, View
+from slam.frames import KEYFRAME_SOURCE, LOOP_SOURCE, RelativePose
+from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
 from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.frontend.keyframes.relative_poses import keyframe_poses
-from slam.geometry.se3 import FloatArray, invert, rotation_angle
-from slam.loops.closure import LoopClosures, Track, find_loops
+from slam.geometry.se3 import FloatArray, apply, invert, make, rotation_angle
+from slam.loops.closure import LoopClosures
 from slam.loops.verification import Loop
 from slam.pipeline import map_closure
 from slam.pipeline.map_closure import MapClosure, close_maps
@@ -51,34 +51,61 @@ def test_maps_before_and_after_a_loss_are_joined_where_the_camera_is_rolled_and_
         assert np.rad2deg(rotation_angle(T[:3, :3].T @ loop.measured.T_from_to[:3, :3])) < 3.0
 
 
-@pytest.mark.filterwarnings(
-    "ignore:Mean of empty slice", "ignore:invalid value"
-)  # it has no corners
-@pytest.mark.slow
-def test_maps_are_joined_where_a_loop_within_one_of_them_has_more_inliers(
+def lap(number: int, forth: bool, unit: float) -> LocalMap:
+    """Eight keyframes two metres along a wall, or back along the one behind, in ``unit`` metres."""
+    rng = np.random.default_rng(int(forth))
+    points = rng.uniform([-3.0, -2.0, 4.0], [5.0, 2.0, 7.0], (300, 3))
+    R = np.eye(3)
+    if not forth:
+        R, points[:, 2] = np.diag([-1.0, 1.0, -1.0]), -points[:, 2]
+    along = np.linspace(0.0, 2.0, 8)
+    T_world_camera = np.array([make(R, np.array([x, 0.0, 0.0])) for x in along])
+    T_map_world = invert(T_world_camera[0 if forth else -1])
+    keyframes = []
+    for k, T in enumerate(T_world_camera if forth else T_world_camera[::-1]):
+        seen = apply(invert(T), points)
+        pixels = room.INTRINSICS.project(seen)
+        size = room.INTRINSICS.width, room.INTRINSICS.height
+        tracks = np.flatnonzero(((pixels >= 0) & (pixels < size)).all(axis=1))
+        T_map_camera = T_map_world @ T
+        T_map_camera[:3, 3] /= unit
+        pixels, depth = pixels[tracks], seen[tracks, 2] / unit
+        none = np.zeros((len(tracks), 32), np.uint8)
+        own = 8 * number + k, invert(T_map_camera), tracks, pixels, pixels, depth, none, None
+        keyframes.append(TrackedKeyframe(*own))
+    return LocalMap(keyframes, apply(T_map_world, points) / unit, [], True)
+
+
+def test_the_unit_of_one_wall_follows_from_two_laps_and_the_turns_between_them(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The loop within the first map is added by hand, for in this small room the window finds such places itself."""
+    """Loops join each wall's maps, three turns lead from one wall to the other, whose unit is 1.6 times as long."""
+    maps = [lap(number, number % 2 == 0, 1.6 if number % 2 else 1.0) for number in range(4)]
+    half = make(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
+    for number, each in enumerate(maps[:-1]):
+        sigmas = np.repeat([0.01, 0.1], 3)
+        last = 8 * number + 7
+        each.turns.append(RelativePose(last, last + 1, half, sigmas, KEYFRAME_SOURCE))
 
-    def find(views: Sequence[View], track: Track, *rest: Any) -> LoopClosures:
-        closures = find_loops(views, track, *rest)
-        last = int(np.flatnonzero(track.maps == 0)[-1])
-        T = invert(track.T_world_camera[0]) @ track.T_world_camera[last]
-        within = RelativePose(
-            int(track.frames[0]), int(track.frames[last]), T, np.full(6, 0.01), LOOP_SOURCE
-        )
-        loop = Loop(within, 1 + max(loop.inliers for loop in closures.accepted), 1.0)
-        return replace(closures, accepted=(*closures.accepted, loop))
+    def find(*arguments: Any) -> LoopClosures:
+        loops = []
+        for earlier, later in ((0, 2), (1, 3)):
+            for k in range(0, 8, 2):
+                one, other = (maps[number].keyframes[k] for number in (earlier, later))
+                rows = np.arange(len(one.track_ids))
+                T = one.T_camera_world @ invert(other.T_camera_world)
+                sigmas = np.full(6, 0.01)
+                pose = RelativePose(one.index, other.index, T, sigmas, LOOP_SOURCE)
+                loops.append(Loop(pose, 50, 1.0, 1.0, np.column_stack([rows, rows])))
+        return LoopClosures(len(loops), len(loops), tuple(loops))
 
     monkeypatch.setattr(map_closure, "find_loops", find)
-    back, closer = (
-        room.there_and_back(90, roll=0.02),
-        room.there_and_back(110, roll=0.5, closer=0.3),
-    )
-    truth = np.concatenate([back, back[:6], closer[95:]])
-    after = closed(room.tracked(truth, [0] * 90 + [9] * 6 + [0] * 15))
-    assert [event.event for event in after.joins] == ["map joined"]
-    assert room.errors(after.poses, truth)[0] < 0.01
+    after = close_maps(maps, keyframe_poses(maps, room.INTRINSICS), room.INTRINSICS)
+    assert set(after.poses.segments.values()) == {0}
+    positions = np.array([after.poses.T_map_camera[k][:3, 3] for k in range(32)])
+    lap_once = np.concatenate([np.linspace(0.0, 2.0, 8), np.linspace(2.0, 0.0, 8)])
+    along = 2.0 / positions[7, 0] * positions[:, 0]
+    np.testing.assert_allclose(along, np.tile(lap_once, 2), atol=0.15)
 
 
 @pytest.mark.slow

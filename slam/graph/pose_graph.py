@@ -38,6 +38,7 @@ HUBER_K = 1.345
 _LARGEST_RESIDUAL = 8.0  # whitened, of a loop or position that is removed
 _OUTLYING = 3.0  # its residual over the median of its kind
 _MAX_ITERATIONS = 100  # of Levenberg-Marquardt
+_MAX_DROPPED_LOOPS = 10  # largest number of loops removed where the system is singular
 _RELATIVE_TOLERANCE = 1e-6  # relative decrease of the error below which it ends
 # g2o's text format
 _TRANSLATION_FIRST = [3, 4, 5, 0, 1, 2]
@@ -52,7 +53,8 @@ class PoseGraph:
 
     Attributes:
         relative_poses: the factors in use, in the order they were added.
-        dropped: loop factors that were left out, as they contradict the rest.
+        dropped: loop factors that were left out: the system was singular with them, or they
+            contradict the rest.
         T_fixed_world: ``(4, 4)``: the world in the axes of the measured positions; the identity
             without any.
     """
@@ -118,12 +120,22 @@ class PoseGraph:
             raise SlamError(
                 "the initial trajectory of the pose graph must be finite rigid transforms"
             )
-        try:
-            self._T_world_camera = self._solve(T_world_camera_initial)
-        except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException among them
-            reason = str(error).strip().partition("\n")[0]
-            raise SlamError(f"the pose graph cannot be solved: {reason}") from error
-        return self._T_world_camera.copy()
+        for _ in range(_MAX_DROPPED_LOOPS + 1):
+            try:
+                self._T_world_camera = self._solve(T_world_camera_initial)
+                return self._T_world_camera.copy()
+            except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException among them
+                reason = str(error).strip().partition("\n")[0]
+                loops = np.flatnonzero(self._is_loop())
+                if not len(loops):
+                    raise SlamError(f"the pose graph cannot be solved: {reason}") from error
+                newest = self.relative_poses.pop(loops[-1])
+                self.dropped.append(newest)
+                logger.warning("loop %d -> %d dropped from the graph: %s", *newest.ends, reason)
+                _check_connected(self.relative_poses, len(T_world_camera_initial))
+        raise SlamError(
+            f"the pose graph cannot be solved even without {len(self.dropped)} loop edges"
+        )
 
     def drop_contradicted(self) -> bool:
         """Drop loops and positions whose residual is large while that of most is small.

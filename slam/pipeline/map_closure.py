@@ -13,7 +13,6 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from slam.frames import KEYFRAME_SOURCE, Intrinsics, RelativePose, TrackingEvent, View
-from slam.frontend.factors import scaled_poses
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.frontend.keyframes.submaps import join
@@ -50,10 +49,9 @@ class MapClosure:
 
     def closures(self, scale: Scale) -> LoopClosures:
         """The loops in the unit of the scale, the accepted ones by the relative poses of the closed maps."""
-        scaled = scaled_poses(self.poses.loops, self.poses, scale)
         accepted = [
-            replace(loop, measured=pose)
-            for pose, loop in zip(scaled, self.loops.accepted, strict=True)
+            replace(loop, measured=scale.scaled(pose))
+            for pose, loop in zip(self.poses.loops, self.loops.accepted, strict=True)
         ]
         return replace(self.loops, accepted=tuple(accepted))
 

@@ -35,7 +35,7 @@ def drive() -> SimulatedSequence:
 
 def oracle() -> OraclePredictor:
     def depth_of(index: int) -> np.ndarray:
-        depth = drive().street.render(index).depth.astype(np.float64)
+        depth = drive().street.depth(index).astype(np.float64)
         return np.where(depth > 0, depth, 200.0)
 
     return OraclePredictor(drive().reference, depth_of, NOISE, FACTOR)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from slam.formats.ply import Ply, write_ply
 from slam.formats.trajectory import Trajectory
@@ -23,6 +24,27 @@ G2O = (
     "EDGE_SE3:QUAT 0 1 0 0 1 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1\n"
 )
 CORNERS = np.array([(0, 0, 1), (1, 0, 1), (0, -2, 1)], [(axis, "<f4") for axis in "xyz"])
+
+
+PROVENANCE = yaml.safe_load("""
+version: 0.1.0
+commit: 3a18a19
+command: erfsfm-slam run --sequence '<b>09</b>' & more
+seed: 0
+device: cpu
+weights: default
+weights_licence: "MIT: trained on our own simulated streets"
+depth_source: network
+""")
+PROVENANCE |= {"weights_sha256": "9f" * 32, "depth_sha256": "9f" * 32}
+PROVENANCE |= {"trained_on": [f"sim/seed{k}" for k in range(20)]}
+TIMING = yaml.safe_load("""
+seconds_total: 61.3
+frames_per_second: 4.9
+cpu_seconds: 118.2
+peak_rss_mb: 1432.1
+stages: {read: 3.1, depth network: 24.0, pose network: 11.2, geometry: 9.8, map: 11.9}
+""")
 
 
 def drive(frames: int, step_m: float, yaw_bias: float) -> FloatArray:
@@ -99,42 +121,14 @@ def metrics_of(
     return {
         "schema": 1,
         "status": "ok",
-        "provenance": {
-            "version": "0.1.0",
-            "commit": "3a18a19",
-            "command": "erfsfm-slam run --sequence '<b>09</b>' & more",
-            "seed": 0,
-            "device": "cpu",
-            "weights": "default",
-            "weights_sha256": "9f" * 32,
-            "weights_licence": "MIT: trained on our own simulated streets",
-            "trained_on": [f"sim/seed{k}" for k in range(20)],
-            "leak": leak,
-            "depth_source": "network",
-            "depth_sha256": "9f" * 32,
-        },
-        "sequence": {"name": "sim/loop <42>", "frames": 300, "length_m": 299.0, "fps": 10.0}
-        if reference
-        else {
-            "name": "video",
-            "frames": 300,
-            "length_m": None,
-            "length_m_reason": truth,
-            "fps": 10.0,
-        },
-        "timing": {
-            "seconds_total": 61.3,
-            "frames_per_second": 4.9,
-            "cpu_seconds": 118.2,
-            "peak_rss_mb": 1432.1,
-            "stages": {
-                "read": 3.1,
-                "depth network": 24.0,
-                "pose network": 11.2,
-                "geometry": 9.8,
-                "map": 11.9,
-            },
-        },
+        "provenance": PROVENANCE | {"leak": leak},
+        "sequence": {"frames": 300, "fps": 10.0}
+        | (
+            {"name": "sim/loop <42>", "length_m": 299.0}
+            if reference
+            else {"name": "video", "length_m": None, "length_m_reason": truth}
+        ),
+        "timing": TIMING,
         "scale": {"mode": mode, "unit": unit, "value": 1.0 if mode == "none" else 1.6503},
         "trajectories": trajectories,
         "graph": {"nodes": 300, "factors": 1483, "coverage": {"50": 0.47, "90": 0.88, "95": 0.93}}

@@ -3,16 +3,13 @@ import pytest
 
 from slam.config.sections import MappingConfig
 from slam.formats.ply import read_ply
-from slam.frames import Frame, Intrinsics
-from slam.frontend import measured
-from slam.frontend.measured import Keyframe
+from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.mapping import submap, surface
 from slam.mapping.depth import KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_open3d
-from slam.runtime.memory import SpillFile
 
 CAMERA = Intrinsics(208, 64, 120.0, 120.0, 103.5, 31.5)
 V, U = np.mgrid[: CAMERA.height, : CAMERA.width]
@@ -86,22 +83,6 @@ def test_one_wall_lands_where_the_camera_saw_it():
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     np.testing.assert_allclose(centre, [1.0, 0.5, 8.0], atol=0.11)
     np.testing.assert_allclose(tsdf_map.mesh().colours, 128, atol=3)
-
-
-def test_thinned_keyframes_keep_the_geometry(monkeypatch):
-    monkeypatch.setattr(measured, "MAP_WIDTH_PX", 70)
-    monkeypatch.setattr(surface, "_LEAST_TRIANGLES", 10)
-    spill_file = SpillFile()
-    thinned = CAMERA.resized(70, round(CAMERA.height * 70 / CAMERA.width))
-    tsdf_map = TsdfMap(MappingConfig(), thinned)
-    for k, z in enumerate((0.0, 0.5, 1.0)):
-        keyframe = Keyframe.of(Frame(k, float(k), GREY), plate(8.0 - z), spill_file)
-        tsdf_map.integrate(
-            KeyframeDepth(0, keyframe.depth_unscaled, None, keyframe.image, pose(1.0, 0.0, z))
-        )
-    vertices = tsdf_map.mesh().points
-    np.testing.assert_allclose(vertices[:, 2], 8.0, atol=0.003)
-    assert abs((vertices[:, 0].min() + vertices[:, 0].max()) / 2 - 1.0) < 0.15
 
 
 def test_depth_inconsistent_between_views_is_left_out():

@@ -18,6 +18,7 @@ import pytest
 from slam import Slam
 from slam.config.sections import load_config
 from slam.formats.trajectory import read_trajectory
+from slam.frames import Intrinsics
 from slam.geometry.se3 import FloatArray, invert
 from slam.sequences.catalogue import open_sequence
 
@@ -29,19 +30,11 @@ NODE = Path(__file__).parents[3] / "tools" / "ros2" / "slam_node.py"
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 FRAMES, FIRST_S = 12, 1_700_000_000
 MESSAGES = {
-    "geometry_msgs": (
-        "Point",
-        "Pose",
-        "PoseStamped",
-        "Quaternion",
-        "Transform",
-        "TransformStamped",
-        "Vector3",
-    ),
-    "nav_msgs": ("MapMetaData", "OccupancyGrid", "Path"),
-    "sensor_msgs": ("CameraInfo", "Image", "PointCloud2", "PointField"),
-    "std_msgs": ("Header",),
-    "builtin_interfaces": ("Time",),
+    "geometry_msgs": "Point Pose PoseStamped Quaternion Transform TransformStamped Vector3",
+    "nav_msgs": "MapMetaData OccupancyGrid Path",
+    "sensor_msgs": "CameraInfo Image PointCloud2 PointField",
+    "std_msgs": "Header",
+    "builtin_interfaces": "Time",
 }
 QOS = {
     "QoSProfile": SimpleNamespace,
@@ -141,7 +134,10 @@ def node_module(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
     for package, kinds in MESSAGES.items():
         module(package)
-        module(f"{package}.msg", **{kind: STORE.types[f"{package}/msg/{kind}"] for kind in kinds})
+        module(
+            f"{package}.msg",
+            **{kind: STORE.types[f"{package}/msg/{kind}"] for kind in kinds.split()},
+        )
     module("rcl_interfaces")
     module("rcl_interfaces.msg", ParameterDescriptor=SimpleNamespace)
     module("rclpy")
@@ -160,11 +156,14 @@ def node_module(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
         "std_srvs.srv", Trigger=SimpleNamespace(Request=SimpleNamespace, Response=SimpleNamespace)
     )
     monkeypatch.syspath_prepend(str(NODE.parent))
-    spec = importlib.util.spec_from_file_location("slam_node", NODE)
-    assert spec is not None and spec.loader is not None
-    loaded = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(loaded)
-    return loaded
+    return loaded(NODE)
+
+
+def loaded(path: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def header(number: int) -> Any:
@@ -180,23 +179,12 @@ def image_message(image: np.ndarray, number: int) -> Any:
     return made(header(number), height, width, "rgb8", 0, 3 * width, image.reshape(-1))
 
 
-def info_message(K: np.ndarray, width: int, height: int) -> Any:
-    made = STORE.types["sensor_msgs/msg/CameraInfo"]
+def info_message(camera: Intrinsics) -> Any:
+    K, made = camera.K, STORE.types["sensor_msgs/msg/CameraInfo"]
     region = STORE.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
     P = np.column_stack([K, np.zeros(3)]).ravel()
-    return made(
-        header(0),
-        height,
-        width,
-        "plumb_bob",
-        np.zeros(5),
-        K.ravel(),
-        np.eye(3).ravel(),
-        P,
-        0,
-        0,
-        region,
-    )
+    lens, straight = ("plumb_bob", np.zeros(5), K.ravel()), np.eye(3).ravel()
+    return made(header(0), camera.height, camera.width, *lens, straight, P, 0, 0, region)
 
 
 def test_the_node_publishes_what_slam_finds(
@@ -221,7 +209,7 @@ def test_the_node_publishes_what_slam_finds(
     add, begin = node.callbacks["image"], node.callbacks["camera_info"]
     add(image_message(images[0], 0))
     assert node.logged == ["no camera_info yet: images are left out"] and not node.published
-    begin(info_message(intrinsics.K, intrinsics.width, intrinsics.height))
+    begin(info_message(intrinsics))
     for number, image in enumerate(images):
         add(image_message(image, number))
     add(image_message(images[-1][:-1], FRAMES))  # of another size
@@ -274,7 +262,7 @@ def test_loops_move_the_map_and_not_the_odometry(
     node_module: ModuleType, kitti_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drive = open_sequence(kitti_root)
-    intrinsics = drive.intrinsics
+    images = [image_message(drive.frame(k).image, k) for k in range(FRAMES)]
     of_base = {"base_frame": "base_link", "map_every": 12, "keyframe_spacing": 0.5, "depth_to": 30}
     asked = {"weights": "sim", "camera_height_m": 1.65, **of_base}
     monkeypatch.setattr(RecordedNode, "parameters", asked)
@@ -282,16 +270,17 @@ def test_loops_move_the_map_and_not_the_odometry(
     T_base_camera[:3, 3] = 0.2, 0.0, 1.65
     node = node_module.SlamNode()
     assert not node.services["close_loops"](None, SimpleNamespace()).success
-    node.callbacks["camera_info"](info_message(intrinsics.K, intrinsics.width, intrinsics.height))
-    node.callbacks["image"](image_message(drive.frame(0).image, 0))
+    add, begin = node.callbacks["image"], node.callbacks["camera_info"]
+    begin(info_message(drive.intrinsics))
+    add(images[0])
     assert node.logged == ["no transform from base_link to the camera yet: images are left out"]
     placed = node_module.transform_of(T_base_camera, header(0), "front_optical").transform
     monkeypatch.setattr(Buffer, "known", {("base_link", "front_optical"): placed})
-    for number in range(10):
-        node.callbacks["image"](image_message(drive.frame(number).image, number))
+    for image in images[:10]:
+        add(image)
     assert node.services["close_loops"](None, SimpleNamespace()).success
-    for number in range(10, FRAMES):
-        node.callbacks["image"](image_message(drive.frame(number).image, number))
+    for image in images[10:]:
+        add(image)
     odom = np.array([matrix(node_module, each) for each in node.published["tf"][::2]])
     in_map = np.array([matrix(node_module, each) for each in node.published["tf"][1::2]])
     np.testing.assert_allclose(
@@ -313,10 +302,8 @@ def test_loops_move_the_map_and_not_the_odometry(
     monkeypatch.setattr(RecordedNode, "parameters", asked | {"publish_tf": "map_to_odom"})
     monkeypatch.setitem(Buffer.known, ("odom", "base_link"), placed)
     of_robot = node_module.SlamNode()
-    of_robot.callbacks["camera_info"](
-        info_message(intrinsics.K, intrinsics.width, intrinsics.height)
-    )
-    of_robot.callbacks["image"](image_message(drive.frame(0).image, 0))
+    of_robot.callbacks["camera_info"](info_message(drive.intrinsics))
+    of_robot.callbacks["image"](images[0])
     (only,) = of_robot.published["tf"]
     assert only.child_frame_id == "odom"
     np.testing.assert_allclose(matrix(node_module, only), invert(T_base_camera), atol=1e-9)
@@ -352,24 +339,16 @@ def test_an_occupancy_grid_follows_its_keyframes(node_module: ModuleType) -> Non
 def test_the_launch_file_gives_every_parameter(
     monkeypatch: pytest.MonkeyPatch, node_module: ModuleType
 ) -> None:
-    for name, kind in (
-        ("launch", "LaunchDescription"),
-        ("launch.substitutions", "LaunchConfiguration"),
-    ):
-        made = ModuleType(name)
-        setattr(made, kind, lambda content: content)
-        monkeypatch.setitem(sys.modules, name, made)
-    actions = ModuleType("launch.actions")
-    vars(actions).update(
+    launch = SimpleNamespace(
+        LaunchDescription=list,
+        LaunchConfiguration=str,
         DeclareLaunchArgument=lambda name, default_value: name,
         ExecuteProcess=lambda cmd, output: cmd,
     )
-    monkeypatch.setitem(sys.modules, "launch.actions", actions)
-    spec = importlib.util.spec_from_file_location("slam_launch", NODE.with_name("slam.launch.py"))
-    assert spec is not None and spec.loader is not None
-    loaded = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(loaded)
-    *arguments, command = loaded.generate_launch_description()
+    for name in ("launch", "launch.substitutions", "launch.actions"):
+        monkeypatch.setitem(sys.modules, name, launch)
+    launch = loaded(NODE.with_name("slam.launch.py"))
+    *arguments, command = launch.generate_launch_description()
     assert set(arguments) == set(node_module.PARAMETERS) | {"image", "camera_info", "map"}
     given = ["".join(part) for part in command if isinstance(part, list)]
     assert "settings:='settings'" in given and "camera_height_m:=camera_height_m" in given
@@ -393,7 +372,7 @@ def test_a_distorted_camera_and_one_that_is_rectified(
     for topic in ("/front/image_raw", "/front/image_rect"):
         monkeypatch.setattr(RecordedNode, "topics", {"image": topic})
         node = node_module.SlamNode()
-        info = info_message(intrinsics.K, intrinsics.width, intrinsics.height)
+        info = info_message(intrinsics)
         info.d = np.array([-0.1, 0.01, 0.0, 0.0, 0.0])
         node.callbacks["camera_info"](info)
         node.callbacks["image"](image_message(image, 0))

@@ -239,6 +239,7 @@ def training_sample(
     seen: TeacherStructure | None,
     config: ExperimentConfig,
     rng: np.random.Generator,
+    fixed: NDArray[np.bool_] | None = None,
 ) -> dict[str, Tensor]:
     """Augment a snippet and make it a sample.
 
@@ -248,17 +249,22 @@ def training_sample(
         seen: what the teacher measured, if there is one.
         config: of the experiment.
         rng: of all random draws.
+        fixed: where the images show what is fixed to the camera, ``(H, W)``, if that is known.
 
     Returns:
         Tensors ``target`` (3, H, W) and ``sources`` (N, 3, H, W) in uint8, and ``K`` (3, 3). With a teacher, also
         ``T_source_target`` (N, 4, 4), ``least`` and ``most`` (1, H, W) of `TeacherStructure`. With weather, also
-        ``shown`` (N + 1, 3, H, W): the images in time order as the networks see them.
+        ``shown`` (N + 1, 3, H, W): the images in time order as the networks see them. With ``fixed``, also that, (1,
+        H, W).
     """
     bounds = [] if seen is None else [seen.least.astype(np.float32), seen.most.astype(np.float32)]
+    bounds += [] if fixed is None else [fixed.astype(np.float32)]
     images, bounds, varied, mirrored = augment(
         images, bounds, camera, config.data, config.network.fidelity, rng
     )
     sample = as_tensors(images, varied.K)
+    if fixed is not None:
+        sample["fixed"] = torch.from_numpy(bounds.pop() > 0)[None]
     if seen is not None:
         mirror, nearer = (
             np.diag([-1 if mirrored else 1, 1, 1, 1]).astype(np.float32),

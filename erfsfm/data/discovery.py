@@ -208,9 +208,11 @@ def _own(root: Path, given: Path | None) -> list[Recording]:
     written = read_camera_file(file)
     if written.is_distorted:
         raise DataError(
-            f"{file} describes a distorted camera: undistort the images before training"
+            f"{file} describes a distorted camera: undistort the images before training, as erfsfm-slam export RUN "
+            "--what nerfstudio does"
         )
     camera = Camera.of(written.pinhole)
+    mask = None if written.mask is None else Path(written.mask)
     images: list[Path] = []
     if not is_video:  # those of a folder, or those of its one sub-folder of a usual name, or of the first that has any
         usual = image_folder(home)
@@ -221,11 +223,13 @@ def _own(root: Path, given: Path | None) -> list[Recording]:
     if not images:
         videos = map(Video, [root] if is_video else list_videos(home))
         return [
-            Recording(f"folder/{video_name(v.path)}", (v.path,) * len(v), camera, v) for v in videos
+            Recording(f"folder/{video_name(v.path)}", (v.path,) * len(v), camera, v, mask=mask)
+            for v in videos
         ]
     files = by_name(images)
     recording = recording_folder(home)
-    whole, maps = Recording(f"folder/{recording.name}", files.paths, camera), recording / "depth"
+    whole = Recording(f"folder/{recording.name}", files.paths, camera, mask=mask)
+    maps = recording / "depth"
     depth = tuple(maps / f"{path.stem}.png" for path in files.paths) if maps.is_dir() else ()
     missing = [path.name for path in depth if not path.is_file()]
     if depth and not missing:  # as a depth camera measures it

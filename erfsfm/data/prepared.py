@@ -36,6 +36,7 @@ _POSES, _LABELS = (
     "poses.txt",
     "labels",
 )  # of a recording: true poses of its camera (KITTI), and the teacher's
+_MASK = "mask.png"
 QUALITY = 90  # of the JPEG images: 16 kB each at 416x128
 _MOST_FRAMES = 10**6  # of one recording: a day at ten frames a second
 
@@ -82,6 +83,7 @@ def read_prepared(root: Path) -> list[Recording]:
             stored=entry.frames,
             without_stops=True,
             labels=folder / _LABELS,
+            mask=mask if (mask := folder / _MASK).is_file() else None,
         )
         recordings.append(recording)
     return recordings
@@ -117,6 +119,10 @@ def write_prepared(
             progress("frames", number, len(recordings))
             folder = unfinished / f"{number:04d}"
             unreadable += _write_images(folder, recording, network)
+            if recording.mask is not None:
+                shown = ~recording.fixed(network.height, network.width)
+                image = cv2.imencode(".png", np.uint8(255) * shown)[1]
+                write_atomically(folder / _MASK, bytes(image), sync=False)
             if number >= len(training):
                 if (depth := recording.true_depth(middle)) is not None:
                     _write_depth(folder, recording.start + middle, depth)

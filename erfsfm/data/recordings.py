@@ -24,6 +24,7 @@ from erfsfm.geometry import Camera
 
 logger = logging.getLogger(__name__)
 
+_WHITE = 250  # grey levels of a resized mask: black ones spread into their neighbours
 _kept: dict[
     Path, Image
 ] = {}  # of this process: the frames ``(N, height, width, 3)`` of each video at one size
@@ -74,7 +75,7 @@ class Recording:
     with gaps, ``skipped`` images come before it and there are ``stored`` in all; pose files may have rows for these
     alone. Of one in a prepared folder, ``labels`` is where the teacher's measurements are, and ``without_stops`` says
     that frames in which the car stands still were taken out before. The frames are every ``stride``-th one from
-    ``start``.
+    ``start``. ``mask`` is black where the images show what is fixed to the camera.
     """
 
     name: str
@@ -94,6 +95,7 @@ class Recording:
     without_stops: bool = False
     stride: int = 1
     labels: Path | None = None
+    mask: Path | None = None
 
     def __len__(self) -> int:
         return len(self.images)
@@ -140,6 +142,14 @@ class Recording:
         image = read_image(stored)
         self._require_size(stored, *image.shape[:2])
         return resize_image(image, height, width)
+
+    def fixed(self, height: int, width: int) -> NDArray[np.bool_]:
+        """Where the images, resized, show what is fixed to the camera ``(height, width)``; nowhere without a mask."""
+        if self.mask is None:
+            return np.zeros((height, width), np.bool_)
+        mask = read_image(self.mask)
+        self._require_size(self.mask, *mask.shape[:2])
+        return resize_image(mask, height, width)[..., 0] < _WHITE
 
     @property
     def exact(self) -> bool:

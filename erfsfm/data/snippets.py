@@ -74,6 +74,10 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         self._many_views, self._imitated = many_views, imitated
         length = config.network.sources + 1
         self.recordings = usable(recordings, length)
+        # by their masks; empty where none has one
+        self._fixed: dict[Path | None, NDArray[np.bool_]] = {}
+        if any(recording.mask for recording in self.recordings):
+            self._fixed = {each.mask: each.fixed(*size) for each in self.recordings}
         self._exact, self._measured = by_label(self.recordings, config)
         weights = config.data.weights
         names = list(dict.fromkeys(recording.name for recording in self.recordings))
@@ -117,11 +121,12 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
             return single_image(image, camera, bounds, self._config, rng)
         snippet, images = first_readable(self._chosen(rng), self._images, self._unreadable)
         camera = self._camera(snippet.recording)
-        seen = self._structure(snippet)
+        seen = self._known(snippet)
         if self._config.single_images:
             assert seen is not None, "there are labels"
             return single_image(images[0], camera, (seen.least, seen.most), self._config, rng)
-        return training_sample(images, camera, seen, self._config, rng)
+        fixed = self._fixed.get(snippet.recording.mask)
+        return training_sample(images, camera, seen, self._config, rng, fixed)
 
     def _camera(self, recording: Recording) -> Camera:
         """At the networks' size."""
@@ -151,6 +156,14 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
                     targets.start - sources // 2, targets.stop - sources // 2, targets.step
                 )
             yield Snippet(recording, starts[int(rng.integers(len(starts)))])
+
+    def _known(self, snippet: Snippet) -> TeacherStructure | None:
+        """The label of a snippet, if there is a teacher, without what is fixed to the camera."""
+        seen, fixed = self._structure(snippet), self._fixed.get(snippet.recording.mask)
+        if seen is None or fixed is None:
+            return seen
+        least, most = np.where(fixed, 0, seen.least), np.where(fixed, np.inf, seen.most)
+        return TeacherStructure(seen.T_source_target, least, most)
 
     def _structure(self, snippet: Snippet) -> TeacherStructure | None:
         """The label of a snippet, if there is a teacher."""

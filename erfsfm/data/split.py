@@ -134,6 +134,11 @@ def split_recordings(
     """
     if not config.roots:
         raise DataError("no data to train on: name data sets with --dataset ROOT or data.roots")
+    if camera is not None and str(camera).startswith("auto"):
+        raise DataError(
+            "--camera auto finds the camera of a run: erfsfm-slam run --dataset DATA --output RUN, then erfsfm-slam "
+            "export RUN --what nerfstudio --output SCENE, and train on SCENE"
+        )
     split = read_split_file(config.split) if config.split else Split()
     division = _Division(config, split)
     found: list[Recording] = []

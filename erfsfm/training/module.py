@@ -85,6 +85,7 @@ class SelfSupervision(lightning.LightningModule):
             batch.get("T_source_target"),
             bounds,
             batch.get("shown"),
+            batch.get("fixed"),
         )
         result = evaluate_objective(self.depth_net, self.pose_net, snippets, self.config)
         self._terms = {name: value.detach() for name, value in result.terms.items()}

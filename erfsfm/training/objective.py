@@ -25,6 +25,8 @@ from erfsfm.losses import (
     translation_disagreement,
 )
 
+_SEEN = 0.99  # of a pixel of a source that shows the world
+
 
 @dataclass(frozen=True)
 class SnippetBatch:
@@ -34,6 +36,7 @@ class SnippetBatch:
     Labels of the teacher (`erfsfm.data.window`), where one is used: ``T_source_target``
     ``(S, N, 4, 4)`` in camera heights, NaN where nothing is known, and ``bounds`` of the B targets' inverse depth.
     With simulated weather: ``shown`` ``(S, N + 1, 3, H, W)``, all images in time order as the networks get them.
+    ``fixed`` ``(S, 1, H, W)`` is true where a snippet shows what is fixed to its camera.
     """
 
     target: Tensor
@@ -42,6 +45,7 @@ class SnippetBatch:
     T_source_target: Tensor | None = None
     bounds: Bounds | None = None
     shown: Tensor | None = None
+    fixed: Tensor | None = None
 
     def seen(self) -> tuple[Tensor, list[Tensor]]:
         """Target and sources as the networks see them, in [-1, 1]."""
@@ -56,7 +60,8 @@ class SnippetBatch:
     def snippets(self) -> SnippetBatch:
         """Images and cameras of the targets that have sources."""
         first = len(self.target) - len(self.sources)
-        return SnippetBatch(self.target[first:], self.sources, self.K[first:])
+        target, K = self.target[first:], self.K[first:]
+        return SnippetBatch(target, self.sources, K, fixed=self.fixed)
 
 
 @dataclass(frozen=True)
@@ -169,20 +174,29 @@ class Level:
     sources: Tensor  # (B, N, 3, h, w)
     K: Tensor
     disparity: Tensor  # (B, 1, h, w)
+    seen: Tensor | None = (
+        None  # (B, 1, h, w), 0 where something fixed to the camera hides the world
+    )
 
     @staticmethod
     def of(batch: SnippetBatch, disparity: Tensor, config: ExperimentConfig) -> Level:
         """Of a batch whose images are shrunk to the size of the disparity."""
         size = (disparity.shape[-2], disparity.shape[-1])
         full = (batch.target.shape[-2], batch.target.shape[-1])
+        seen = (
+            None
+            if batch.fixed is None
+            else 1.0 - F.adaptive_max_pool2d(batch.fixed.to(batch.target), size)
+        )
         if size == full:
-            return Level(batch.target, batch.sources, batch.K, disparity)
+            return Level(batch.target, batch.sources, batch.K, disparity, seen)
         sources = F.interpolate(batch.sources.flatten(0, 1), size=size, mode="area")
         return Level(
             F.interpolate(batch.target, size=size, mode="area"),
             sources.reshape(*batch.sources.shape[:3], *size),
             scale_intrinsics(batch.K, size, full, config.network.fidelity),
             disparity,
+            seen,
         )
 
     def errors(self, T_source_target: Tensor, ssim_weight: float) -> tuple[Tensor, Tensor]:
@@ -194,7 +208,11 @@ class Level:
         warped = sample(self.sources.flatten(0, 1), grid)
         error = photometric_error(self.target.repeat_interleave(count, dim=0), warped, ssim_weight)
         shape = (len(self.target), count, *error.shape[-2:])
-        return error.reshape(shape), valid.reshape(shape)
+        error, valid = error.reshape(shape), valid.reshape(shape)
+        if self.seen is not None:
+            source = sample(self.seen.repeat_interleave(count, dim=0), grid).reshape(shape)
+            valid = valid & (self.seen > 0) & (source > _SEEN)
+        return error, valid
 
     def photometric(self, T_source_target: Tensor, loss: LossConfig) -> Tensor:
         """Their mean over pixels, reduced over sources as the loss wants it."""

@@ -10,11 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Frame
-from slam.frontend.tracking import CornerTracker
+from slam.frontend.tracking import Search, Texture, are_inside, new_corners, track
 from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray
 
-_WIDTH_PX = 960
+# corners of plain walls creep, and windows beyond the border slip: both bend a focal length by 3 %
+_SEARCH = Search(
+    side=16, levels=4, limits=(20, 0.02), back=None, error_px=0.5, norm=np.inf, texture=1e-4
+)
+_CORNERS = Texture(quality=0.01, spacing_px=10.0, block_px=5)
+_MOST_CORNERS, _WIDTH_PX, _BORDER_PX = 500, 960, 8.0
 _MOST_KEYFRAMES = 450
 _KEYFRAME_MOVED = 0.06  # half widths, from keyframe to keyframe
 _KEYFRAME_LOST = 0.5  # of the corners of the last keyframe
@@ -57,15 +62,16 @@ class CornerRecord:
         self._last, self._last_ids = np.zeros((0, 2)), np.zeros(0, np.int64)
         self._rows: list[FloatArray] = [np.zeros((0, 4))]
 
-    def add(self, ids: NDArray[np.int64], image: FloatArray) -> None:
-        """Keep the corners of an image, by their identifiers ``(M,)`` and in half widths ``(M, 2)``, if it is far."""
+    def is_far(self, ids: NDArray[np.int64], image: FloatArray) -> bool:
+        """Whether corners, by their identifiers ``(M,)`` and in half widths ``(M, 2)``, are far from the keyframe's."""
         _, own, at_last = np.intersect1d(ids, self._last_ids, return_indices=True)
         moved = np.linalg.norm(image[own] - self._last[at_last], axis=1)
-        is_near = (
-            len(own) > _KEYFRAME_LOST * len(self._last_ids) and median(moved) < _KEYFRAME_MOVED
-        )
+        return len(own) <= _KEYFRAME_LOST * len(self._last_ids) or median(moved) >= _KEYFRAME_MOVED
+
+    def keep(self, ids: NDArray[np.int64], image: FloatArray) -> None:
+        """Make an image a keyframe, with corners as `is_far` has them, unless there are many."""
         keyframe = len(self._rows) - 1
-        if is_near or keyframe == _MOST_KEYFRAMES:
+        if keyframe == _MOST_KEYFRAMES:
             return
         self._last, self._last_ids = image, ids
         self._rows.append(np.column_stack([np.full(len(ids), keyframe), ids, image]))
@@ -79,15 +85,25 @@ class CornerRecord:
 
 def follow(frames: Iterable[Frame]) -> FollowedCorners:
     """Corners in the keyframes of some frames."""
-    record, tracker, before, width = CornerRecord(), CornerTracker(), None, 1
+    record, pixels, ids = CornerRecord(), np.zeros((0, 2), np.float32), np.zeros(0, np.int64)
+    sought, width, before = 0, 1, None
     for frame in frames:
         height, width = frame.image.shape[:2]
         ratio = min(_WIDTH_PX / width, 1.0)  # following corners of wide images takes long
         frame = frame.resized(round(ratio * width), round(ratio * height))
         height, width = frame.grey.shape
         if before is not None:
-            tracks = tracker.track(before, frame)
-            middle = (width - 1) / 2, (height - 1) / 2
-            record.add(tracks.track_ids, (tracks.current - middle) * (2.0 / width))
-        before = frame
+            pixels, kept = track(before, frame.grey, pixels, _SEARCH)
+            inner = height - 2 * _BORDER_PX, width - 2 * _BORDER_PX
+            kept &= are_inside(pixels - _BORDER_PX, inner) & ~frame.is_fixed(pixels)
+            pixels, ids = pixels[kept], ids[kept]
+        before = frame.grey
+        middle, pixel = np.array([(width - 1) / 2, (height - 1) / 2]), 2.0 / width
+        if not record.is_far(ids, (pixels - middle) * pixel):
+            continue
+        corners = new_corners(frame, pixels, _MOST_CORNERS - len(pixels), _CORNERS)
+        pixels = np.concatenate([pixels, corners])
+        ids = np.concatenate([ids, sought + np.arange(len(corners))])
+        sought += len(corners)
+        record.keep(ids, (pixels - middle) * pixel)
     return record.seen(2.0 / width)

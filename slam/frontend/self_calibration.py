@@ -39,6 +39,7 @@ _LEAST_SIGHTINGS = 600  # of a window that counts
 # logarithm of the focal length, both radial coefficients, principal point
 _PRIOR = np.array([-np.log(np.tan(np.deg2rad(UNKNOWN_FOV_DEG) / 2)), 0.0, 0.0, 0.0, 0.0])
 _PRIOR_SIGMAS = np.array([0.5, 0.15, 0.05, 0.024, 0.024])
+_MOST_ODD = 5.0  # prior sigmas of a lens or principal point: what is beyond is a false minimum
 _ALL, _BUT_FOCAL, _NOTHING = 0, 1, 5  # the first of these that is free
 _FEW, _MANY = 5, 25  # iterations
 # where all keyframes turn on the spot: sigmas of sightings, one after the other, how far keyframes lie apart, and 1
@@ -207,7 +208,8 @@ def calibrated(seen: FollowedCorners) -> Window | None:
         problem, start = problem.without_outliers(start, 5.0)
         sigma = problem.spread(start)
     start = problem.solved(start, free, sigma, _MANY)
-    if len(problem.seen) < _LEAST_SIGHTINGS:
+    is_odd = np.abs(start.lens - _PRIOR)[1:] > _MOST_ODD * _PRIOR_SIGMAS[1:]
+    if len(problem.seen) < _LEAST_SIGHTINGS or is_odd.any():
         return None
     turn = np.linalg.norm(start.turns[:, :2], axis=1).max() + 1e-9
     sigmas = problem.lens_sigmas(start, free, sigma)

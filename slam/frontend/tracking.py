@@ -49,7 +49,8 @@ class Search(NamedTuple):
     ``limits`` are most iterations, and the shift in pixels below which they end. A corner is kept
     if a search ``back`` returns to within ``error_px`` by a ``norm`` of this order. That has its
     own levels and limits and begins where corners came from; without them it is the same search,
-    and begins where they were found.
+    and begins where they were found. Windows whose gradients have a smaller least eigenvalue than
+    ``texture`` are not sought.
     """
 
     side: int
@@ -58,6 +59,7 @@ class Search(NamedTuple):
     back: tuple[int, tuple[int, float]] | None
     error_px: float
     norm: float
+    texture: float = _LEAST_TEXTURE
 
 
 class Texture(NamedTuple):
@@ -95,11 +97,13 @@ def track(
     """
     guesses = pixels if guesses is None else guesses
     moved, forward = _lucas_kanade(
-        first, second, pixels, guesses, search.side, search.levels, search.limits
+        first, second, pixels, guesses, search.side, search.levels, search.limits, search.texture
     )
     levels, limits = search.back or (search.levels, search.limits)
     start = moved if search.back is None else pixels
-    returned, backward = _lucas_kanade(second, first, moved, start, search.side, levels, limits)
+    returned, backward = _lucas_kanade(
+        second, first, moved, start, search.side, levels, limits, search.texture
+    )
     near = np.linalg.norm(returned - pixels, search.norm, axis=1) < search.error_px
     return moved, forward & backward & near
 
@@ -112,6 +116,7 @@ def _lucas_kanade(
     side: int,
     levels: int,
     limits: tuple[int, float],
+    texture: float = _LEAST_TEXTURE,
 ) -> tuple[Pixels, NDArray[np.bool_]]:
     if not len(pixels):
         return pixels, np.zeros(0, np.bool_)
@@ -124,7 +129,7 @@ def _lucas_kanade(
         maxLevel=levels,
         criteria=(_TERMINATION, *limits),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        minEigThreshold=_LEAST_TEXTURE,
+        minEigThreshold=texture,
     )
     return moved.reshape(-1, 2), status.ravel().astype(bool)
 

@@ -337,7 +337,8 @@ class VisualOdometry:
         length = step.motion.length_unscaled
         self.depth_error = self.depth_error.with_step(learned[still], nearness, sigma, length)
         image = rays[1][:, :2] * self._intrinsics.focal_half_widths
-        self.corners.add(tracks.track_ids[still], image)
+        if self.corners.is_far(tracks.track_ids[still], image):
+            self.corners.keep(tracks.track_ids[still], image)
         self._points = step.motion.ends[1], step.points
         self._fitted = tracks.track_ids[two_view.inliers]
 

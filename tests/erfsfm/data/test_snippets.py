@@ -165,6 +165,25 @@ def test_weather_changes_only_the_network_input(coded: Path) -> None:
     assert 3 <= changed <= 16
 
 
+def test_what_a_mask_hides_comes_with_every_sample(coded: Path) -> None:
+    mask = np.full((32, 48), 255, np.uint8)
+    mask[24:] = 0
+    cv2.imwrite(str(coded / "mask.png"), mask)
+    with (coded / "a" / "camera.yaml").open("a") as file:
+        file.write("mask: ../mask.png\n")
+    draws = SnippetDraws(discover(coded), experiment(zoom=1.0), 20)
+    for sample in map(draws.draw, range(20)):
+        is_masked = folder_of(sample) == "a"
+        assert sample["fixed"].shape == (1, 32, 48)
+        assert bool(sample["fixed"][0, 24:].all()) == is_masked
+        assert not sample["fixed"][0, :23].any()
+
+
+def test_a_camera_that_has_to_be_found_is_found_by_a_run(coded: Path) -> None:
+    with pytest.raises(DataError, match="erfsfm-slam run"):
+        split_recordings(experiment(roots=[str(coded)]).data, Path("auto"))
+
+
 def test_resuming_draws_the_same_samples(coded: Path) -> None:
     whole = batches(coded, 0)
     for workers in (0, 2):

@@ -274,6 +274,24 @@ def test_the_mask_keeps_what_moves(batch: SnippetBatch, plane) -> None:
     )
 
 
+@pytest.mark.parametrize("reduction", ["mean", "minimum"])
+def test_what_is_fixed_to_the_camera_has_no_error(batch: SnippetBatch, reduction: str) -> None:
+    """The lower half is hidden by something that no motion explains."""
+    half = batch.target.shape[2] // 2
+    fixed = torch.zeros_like(batch.target[:, :1], dtype=torch.bool)
+    fixed[:, :, half:] = True
+    target = batch.target.clone()
+    target[:, :, half:] = torch.rand_like(target[:, :, half:])
+    config, depth = experiment(reduction=reduction, ssim_weight=0.0), 1 / 2.0
+    known, other = (
+        evaluate(
+            SnippetBatch(image, batch.sources, batch.K, fixed=fixed), config, depth, true_poses()
+        )
+        for image in (batch.target, target)
+    )
+    assert float(known.terms["photometric"]) == pytest.approx(float(other.terms["photometric"]))
+
+
 def test_autocast_does_not_reach_the_geometry(plane, batch: SnippetBatch) -> None:
     single = SnippetBatch(batch.target.float(), batch.sources.float(), batch.K.float())
     config = experiment(ssim_weight=0.85)

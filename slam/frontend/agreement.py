@@ -174,7 +174,9 @@ def of_positions(
 def of_directions(T_odometry: FloatArray) -> Agreement:
     """By poses ``(N, 4, 4)`` of a vehicle: it goes along one axis of its camera, forwards or backwards."""
     tenths = np.floor(path_distance(T_odometry) / _LEAST_APART)
-    apart = T_odometry[np.diff(tenths, prepend=-1.0) > 0]
+    is_apart = np.diff(tenths, prepend=-1.0) > 0
+    is_apart[-1] = True
+    apart = T_odometry[is_apart]
     steps = (invert(apart[:-1]) @ apart[1:])[:, :3, 3]
     lengths = np.linalg.norm(steps, axis=1)
     moved = steps[lengths > _LEAST_MOVED * np.quantile(lengths, 0.9)]

@@ -21,7 +21,7 @@ def long_street() -> SimulatedStreet:
 
 @cache
 def grey(frame: int) -> NDArray[np.uint8]:
-    return long_street().render(frame).image[..., 1].copy()
+    return long_street().render(frame)[..., 1].copy()
 
 
 def seen(

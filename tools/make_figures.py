@@ -26,7 +26,7 @@ from slam.formats.trajectory import Trajectory
 from slam.frames import Sequence
 from slam.geometry.se3 import FloatArray
 from slam.results.folder import RunFolder
-from slam.results.report.figures import LOOKS, MapMesh, thinned_mesh
+from slam.results.report.figures import LOOKS, Mesh, thinned_mesh
 from slam.results.report.page import narrowed
 from slam.runtime.files import MAP_MESH, REFERENCE, TRAJECTORIES
 from slam.runtime.imports import import_open3d
@@ -119,13 +119,14 @@ def overview(
     return np.concatenate([top, bottom], axis=0)
 
 
-def above(mesh: MapMesh, width: int) -> NDArray[np.uint8]:
+def above(mesh: Mesh, width: int) -> NDArray[np.uint8]:
     """The map from above; z ahead is up."""
+    points = mesh[0]
     (x0, z0), (x1, z1) = (
-        np.percentile(mesh.points[:, [0, 2]], percent, axis=0) for percent in (0.5, 99.5)
+        np.percentile(points[:, [0, 2]], percent, axis=0) for percent in (0.5, 99.5)
     )
     x, z = np.meshgrid(np.linspace(x0, x1, width), np.arange(z1, z0, -(x1 - x0) / width))
-    origins = np.stack([x, np.full_like(x, mesh.points[:, 1].min() - 1.0), z], axis=-1)
+    origins = np.stack([x, np.full_like(x, points[:, 1].min() - 1.0), z], axis=-1)
     return cast(mesh, origins, np.array([0.0, 1.0, 0.0]))
 
 
@@ -155,16 +156,17 @@ def draw_trajectories(
     return axes
 
 
-def cast(mesh: MapMesh, origins: FloatArray, directions: FloatArray) -> NDArray[np.uint8]:
+def cast(mesh: Mesh, origins: FloatArray, directions: FloatArray) -> NDArray[np.uint8]:
     """Colours ``(H, W, 3)`` where rays ``(H, W, 3)`` meet a mesh, and of the sky elsewhere."""
     o3d = import_open3d()
     scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(mesh.points.astype(np.float32), mesh.triangles.astype(np.uint32))
+    points, colours, triangles = mesh
+    scene.add_triangles(points.astype(np.float32), triangles.astype(np.uint32))
     rays = np.concatenate(np.broadcast_arrays(origins, directions), axis=-1).astype(np.float32)
     hit = scene.cast_rays(o3d.core.Tensor(rays))
     reached = np.isfinite(hit["t_hit"].numpy())
     u, v = hit["primitive_uvs"].numpy()[reached].T
-    corners = mesh.colours[mesh.triangles[hit["primitive_ids"].numpy()[reached]]].astype(np.float32)
+    corners = colours[triangles[hit["primitive_ids"].numpy()[reached]]].astype(np.float32)
     picture = np.tile(np.array(SKY, np.uint8), (*reached.shape, 1))
     mixed = np.einsum("pc,pcr->pr", np.stack([1.0 - u - v, u, v], axis=1), corners)
     picture[reached] = np.clip(np.rint(mixed), 0, 255).astype(np.uint8)

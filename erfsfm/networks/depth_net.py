@@ -67,8 +67,6 @@ class DisparityNetwork(nn.Module):
             In training mode four disparities, finest first, ``(B, 1, ceil(H / 2^s), ceil(W / 2^s))``;
             in evaluation mode the finest alone, ``(B, 1, H, W)``.
         """
-        if image.dim() != 4 or image.shape[1] != 3:
-            raise ValueError(f"image must have shape (B, 3, H, W); got {tuple(image.shape)}")
         disparities = self.decode(image, self.encoder(image))
         return disparities if self.training else disparities[0]
 

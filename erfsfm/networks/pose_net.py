@@ -77,22 +77,7 @@ class PoseNet(nn.Module):
         Returns:
             ``T_source_target`` as translation (unscaled) and XYZ Euler angles (radians),
             (tx, ty, tz, rx, ry, rz), ``(B, N, 6)``.
-
-        Raises:
-            ValueError: if there are not N sources.
         """
-        stages = self.encoder(_stacked(target, sources, self.sources))
+        stages = self.encoder(torch.cat([target, *sources], dim=1))
         pooled: Tensor = self.pose_head(stages[-1]).mean(dim=(2, 3))  # (B, 6 * N)
         return POSE_SCALE * pooled.view(-1, self.sources, 6)
-
-
-def _stacked(target: Tensor, sources: Sequence[Tensor], count: int) -> Tensor:
-    """Target and `count` sources ``(B, 3, H, W)`` as one input ``(B, 3 * (1 + count), H, W)``."""
-    if len(sources) != count:
-        raise ValueError(f"this pose network takes {count} sources; got {len(sources)}")
-    for image in (target, *sources):
-        if image.dim() != 4 or image.shape[1] != 3 or image.shape != target.shape:
-            raise ValueError(
-                f"images must have one shape (B, 3, H, W): {tuple(target.shape)} and {tuple(image.shape)}"
-            )
-    return torch.cat([target, *sources], dim=1)

@@ -183,10 +183,7 @@ def field_of(
     """
     image = image.detach().clone().requires_grad_()
     output = encoder(image)[-1]
-    map_size = (output.shape[2], output.shape[3])
-    row, column = pixel or (map_size[0] // 2, map_size[1] // 2)
-    if not (0 <= row < map_size[0] and 0 <= column < map_size[1]):
-        raise ValueError(f"pixel must lie in the map of size {map_size}; got {(row, column)}")
+    row, column = pixel or (output.shape[2] // 2, output.shape[3] // 2)
     (gradient,) = torch.autograd.grad(output[0, :, row, column].sum(), image)
     gradient = gradient[0].abs().sum(dim=0)  # (H, W)
     seen = gradient > rounding * gradient.max()

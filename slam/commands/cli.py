@@ -67,7 +67,7 @@ def run(
     rerun: Annotated[
         Path | None, typer.Option(help="also write an .rrd file for the rerun viewer (extra)")
     ] = None,
-    gps: Annotated[Path | None, typer.Option(help="GPS track, CSV or NMEA")] = None,
+    gps: Annotated[Path | None, typer.Option(help="GPS track, CSV")] = None,
     seed: Seed = 0,
     device: Device = "auto",
     as_json: Json = False,

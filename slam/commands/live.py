@@ -68,20 +68,20 @@ def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
         )
         source.fps, name = camera.fps, Path(without_secrets(request.dataset)).stem or "live"
         sequence = StreamedSequence(name, source, camera, request.wait, request.every_frame)
-        prediction = open_prediction(
+        predictor, networks, depth = open_prediction(
             request.weights, request.device, settings.depth, sequence.intrinsics
         )
-        pipeline = SlamPipeline(sequence, prediction.predictor, settings, seed=request.seed)
+        pipeline = SlamPipeline(sequence, predictor, settings, seed=request.seed)
         pipeline.require_possible()
         blank = np.zeros((sequence.intrinsics.height, sequence.intrinsics.width, 3), np.uint8)
-        prediction.networks.depth(blank)  # both are loaded before images come
-        prediction.networks.poses([blank] * (prediction.networks.sources + 1))
+        networks.depth(blank)  # both are loaded before images come
+        networks.poses([blank] * (networks.sources + 1))
         viewer = Viewer(sequence.intrinsics) if request.view else None
         folder = RunFolder.create(request.output, Path(settings.output.root), name, lock)
         recorder = LiveRecorder(
-            folder, pipeline, settings, provenance_of(request, prediction, sequence)
+            folder, pipeline, settings, provenance_of(request, sequence, networks, depth)
         )
-        poses = LivePoses(prediction.networks.sources, pipeline.unit)
+        poses = LivePoses(networks.sources, pipeline.unit)
         recorder.follow(sequence, poses, emit, viewer)
         try:
             # in a thread: the sequence's lock may be held by the code that is interrupted

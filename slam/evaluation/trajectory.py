@@ -45,15 +45,6 @@ _OPPOSITE = -0.9  # cosine between the positions of snippets
 _REFERENCE_STANDS_STILL = Failed("the reference does not move, so scaling would hide every error")
 
 
-@dataclass(frozen=True)
-class SegmentErrors:
-    """Errors of all segments of one path length, both ``(S,)``: ``translation_m``, ``rotation`` in radians."""
-
-    length_m: float
-    translation_m: FloatArray
-    rotation: FloatArray
-
-
 def aligned(trajectories: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
     """Estimates brought to the reference by the best similarity of positions (Umeyama 1991).
 
@@ -90,7 +81,7 @@ def paired(trajectories: Mapping[str, Trajectory]) -> Iterator[tuple[str, Trajec
 
 def segment_errors(
     T_world_estimate: FloatArray, T_world_reference: FloatArray, lengths_m: Iterable[float]
-) -> list[SegmentErrors]:
+) -> list[tuple[float, FloatArray, FloatArray]]:
     """Relative errors of all segments of each length within the true path, starting every ten frames.
 
     A segment ends at the first frame beyond its length. Lengths without a segment are left out.
@@ -99,6 +90,9 @@ def segment_errors(
         T_world_estimate: poses ``(N, 4, 4)``, row k beside row k of the reference, in metres.
         T_world_reference: true poses ``(N, 4, 4)``.
         lengths_m: path lengths, in increasing order.
+
+    Returns:
+        Each length, and the errors of its segments ``(S,)``: translation in metres, rotation in radians.
     """
     distance = se3.path_distance(T_world_reference)
     segments = []
@@ -109,7 +103,7 @@ def segment_errors(
         if not fits.any():
             break
         errors = relative_errors(T_world_estimate, T_world_reference, starts[fits], ends[fits])
-        segments.append(SegmentErrors(length_m, *errors))
+        segments.append((length_m, *errors))
     return segments
 
 
@@ -159,7 +153,9 @@ class Aligned:
         first = np.arange(len(self.T_world_estimate) - 1)
         return relative_errors(self.T_world_estimate, self.T_world_reference, first, first + 1)
 
-    def drift(self, errors_per_m: Callable[[SegmentErrors], FloatArray]) -> float | Failed:
+    def drift(
+        self, errors_per_m: Callable[[float, FloatArray, FloatArray], FloatArray]
+    ) -> float | Failed:
         """KITTI's drift: the mean over all segments of 100 to 800 m of true path."""
         segments = segment_errors(self.T_world_estimate, self.T_world_reference, KITTI_LENGTHS_M)
         if not segments:
@@ -167,7 +163,7 @@ class Aligned:
             return Failed(
                 f"no segment of {KITTI_LENGTHS_M[0]:.0f} m fits into the path of {path_m:.1f} m"
             )
-        return float(np.concatenate([errors_per_m(each) for each in segments]).mean())
+        return float(np.concatenate([errors_per_m(*each) for each in segments]).mean())
 
 
 class Statistic(NamedTuple):
@@ -188,12 +184,12 @@ def _ate(pair: Aligned) -> float:
 
 
 _T_REL = Statistic(
-    "t_rel\n%", 2, lambda pair: pair.drift(lambda each: 100.0 * each.translation_m / each.length_m)
+    "t_rel\n%", 2, lambda pair: pair.drift(lambda length_m, shift_m, _: 100.0 * shift_m / length_m)
 )
 _R_REL = Statistic(
     "r_rel\ndeg/100m",
     3,
-    lambda pair: pair.drift(lambda each: 100.0 * np.rad2deg(each.rotation) / each.length_m),
+    lambda pair: pair.drift(lambda length_m, _, turn: 100.0 * np.rad2deg(turn) / length_m),
 )
 _RPE_M = Statistic("RPE\nm", 4, lambda pair: float(pair.step_errors[0].mean()))
 _RPE_DEG = Statistic("RPE\ndeg", 4, lambda pair: float(np.rad2deg(pair.step_errors[1].mean())))

@@ -47,7 +47,7 @@ def make_factors(drive: Drive, scale: Scale, level: int = logging.INFO) -> list[
             geometric.append(replace(pose, student_t_dof=STUDENT_T_DOF))
         else:  # its length is that by learned depth
             geometric.append(scale.scaled(motion.relative_pose))
-    by_keyframes = scaled_poses(maps.poses, maps, scale)
+    by_keyframes = [scale.scaled(pose) for pose in maps.poses]
     steps = network_steps(drive.trusted)
     calibration = calibrate_network(steps, [*geometric, *by_keyframes], scale.per_frame)
     logger.log(level, "pose network: %s", calibration.over(scale.per_frame))
@@ -67,17 +67,6 @@ def make_factors(drive: Drive, scale: Scale, level: int = logging.INFO) -> list[
 def _outside(maps: KeyframePoses, poses: Sequence[RelativePose]) -> list[RelativePose]:
     """The poses between frames that do not both lie in one connected component of maps."""
     return [pose for pose in poses if not maps.is_inside(pose)]
-
-
-def scaled_poses(
-    poses: Sequence[RelativePose], maps: KeyframePoses, scale: Scale
-) -> list[RelativePose]:
-    """Poses by keyframes in the unit of the scale: one factor for each map, in which lengths are consistent."""
-    units = {}
-    for segment in set(maps.segments.values()):
-        frames = [frame for frame, number in maps.segments.items() if number == segment]
-        units[segment] = maps.learned_units[segment] * float(np.median(scale.per_frame[frames]))
-    return [pose.scaled(units[maps.segments[pose.from_index]]) for pose in poses]
 
 
 def chain_odometry(factors: Sequence[RelativePose], count: int) -> FloatArray:

@@ -30,7 +30,7 @@ from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.road import RoadStep
 from slam.frontend.visual.motion import Motion, links
-from slam.geometry.robust import mad_sigma, median, running_median
+from slam.geometry.robust import difference_equations, mad_sigma, median, running_median
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import Failed
 
@@ -42,7 +42,6 @@ _LEAST_ROAD = 1 / 3
 _MAX_CONTRADICTION = 2.5  # largest factor between a measured length and that by learned depth
 _REJECTION_SIGMAS = 3.0  # distance from the median beyond which a frame is left out
 MIN_FRAMES = 5  # least number of usable frames of a scale
-_SMOOTHING_FRAMES = 41  # window over which the scale of a frame is averaged, frames
 _ITERATIONS = 20
 _HUBER_ITERATIONS = 5
 _HUBER_K = 1.345
@@ -61,7 +60,8 @@ _FIRST_WALK = 100.0  # factor on it in the first iteration, halved in each
 # steps over which learned lengths are compared with those by points, and their usual difference
 _NOISE_STEPS, _USUAL_NOISE = 20, 0.08
 _MOST_NOISE_BESIDE_ROAD = 2.0  # of learned lengths that a length by the road may contradict
-_UNIT_SIGMA = 0.2  # sigma of that scale by the learned ground plane
+# sigmas of that scale by the learned ground planes: of all, that share an error, and of one frame's change
+_UNIT_SIGMA, _PLANE_SIGMA = 0.2, 0.1
 _ACCELERATION_SIGMA = 3.0  # of a vehicle, in camera heights: 5 m/s2 at 1.65 m
 _RATE_STEPS = 101  # around a step that was not measured, whose frames are as long as theirs
 _SPEED_STEPS = 11  # window over which the speed is averaged that a change is compared with
@@ -180,16 +180,29 @@ def find_scale(unit: Unit, drive: Drive, lidar_steps: Sequence[RelativePose] = (
     height = 1.0 if height_m is None else height_m
     absolute = _absolute_lengths(drive.road_steps, height, lidar_steps)
     by_planes = scale_from_road(drive.measured.roads, height)
-    prior_unit = _prior_unit(drive.measured.roads, motions, absolute, by_planes, height)
     steps = links(motions, frames)
+    if isinstance(by_planes, Failed):
+        both = motions.keys() & absolute.keys()
+        ratios = [absolute[ends][0] / motions[ends].length_unscaled for ends in both]
+        prior_unit = float(np.median(ratios)) if ratios else 1.0
+    else:
+        prior_unit = by_planes.value
     evidence = gather_evidence(steps, drive.steps, absolute, prior_unit)
     if not isinstance(by_planes, Failed):
         # a car ahead taken for the road for seconds would outweigh all other measurements
         most = np.log(_MAX_CONTRADICTION) * min(evidence.learned_noise(), _MOST_NOISE_BESIDE_ROAD)
         evidence.absolute[np.abs(evidence.absolute - evidence.learned) > most] = np.nan
+        planes = _ratios(drive.measured.roads, height)[[first for first, _ in steps]]
+        evidence.plane[:] = np.log(planes / by_planes.value)
+        over_prior = evidence.absolute - evidence.learned
+        if np.isfinite(over_prior).any():  # rain biases the learned plane: its changes alone count
+            evidence.plane[:] += np.nanmedian(over_prior)
     solved = solve_lengths(evidence, height)
     row_at = np.searchsorted([first for first, _ in steps], np.arange(frames), side="right") - 1
-    per_frame = prior_unit * solved.unit_correction[row_at]
+    unit_correction = solved.unit_correction
+    if drive.by_keyframes:  # maps have the unit of learned depth, one along the drive
+        unit_correction = np.full_like(unit_correction, np.median(unit_correction))
+    per_frame = prior_unit * unit_correction[row_at]
     misfit = np.abs(evidence.absolute - np.log(solved.length))
     used = int(np.isfinite(misfit).sum())
     estimate = by_planes
@@ -226,25 +239,6 @@ def _absolute_lengths(
     return absolute
 
 
-def _prior_unit(
-    roads: Sequence[float | Failed],
-    motions: Mapping[Ends, Motion],
-    absolute: Mapping[Ends, tuple[float, float]],
-    by_planes: ScaleEstimate | Failed,
-    camera_height: float,
-) -> FloatArray:
-    """The mode's unit per unscaled length near each frame ``(N,)``, before lengths are solved."""
-    if isinstance(by_planes, Failed):
-        both = motions.keys() & absolute.keys()
-        ratios = [absolute[ends][0] / motions[ends].length_unscaled for ends in both]
-        return np.full(len(roads), float(np.median(ratios)) if ratios else 1.0)
-    if absolute:
-        # steps of known length measure the drift of the unit; rain or a car ahead biases the
-        # learned ground plane
-        return np.full(len(roads), by_planes.value)
-    return scale_track(roads, camera_height, by_planes)
-
-
 def height_by_lidar(lidar_steps: Sequence[RelativePose], drive: Drive) -> float | None:
     """The camera's height from steps measured by LiDAR and the road, or else by learned planes; None without both."""
     metres = {pose.ends: float(np.linalg.norm(pose.T_from_to[:3, 3])) for pose in lidar_steps}
@@ -275,27 +269,6 @@ def scale_from_road(roads: Sequence[float | Failed], height: float = 1.0) -> Sca
     return ScaleEstimate(float(np.exp(np.median(kept))), spread, len(kept))
 
 
-def scale_track(
-    roads: Sequence[float | Failed], height: float, estimate: ScaleEstimate
-) -> FloatArray:
-    """The scale near each frame ``(N,)``: a running median over ground planes.
-
-    The unit of learned depth drifts along a drive. Where the 41 frames around a frame hold too few
-    usable planes, the estimate of the whole drive is used.
-
-    Args:
-        roads: the camera's unscaled height over the ground plane of each frame.
-        height: the same height in the unit of the result.
-        estimate: of the whole drive.
-    """
-    ratios = _ratios(roads, height)
-    bound = _REJECTION_SIGMAS * max(estimate.spread, 0.02)
-    ratios[np.abs(np.log(ratios / estimate.value)) > bound] = np.nan
-    known = np.pad(np.isfinite(ratios), _SMOOTHING_FRAMES // 2)
-    counts = np.lib.stride_tricks.sliding_window_view(known, _SMOOTHING_FRAMES).sum(axis=1)
-    return np.where(counts >= MIN_FRAMES, running_median(ratios, _SMOOTHING_FRAMES), estimate.value)
-
-
 def _ratios(roads: Sequence[float | Failed], height: float) -> FloatArray:
     """The camera's height over that above each ground plane ``(N,)``, NaN without one."""
     return np.array([np.nan if isinstance(road, Failed) else height / road for road in roads])
@@ -306,7 +279,8 @@ class StepEvidence:
     """Measurements of S steps, logarithms and their sigmas ``(S,)`` each, NaN where there is none.
 
     ``ratio`` is the length over that of the step before; ``absolute`` the length in the mode's
-    unit; ``learned`` the length by learned depth, already in the prior unit of the networks.
+    unit; ``learned`` the length by learned depth, already in the prior unit of the networks, and
+    ``plane`` that unit by the ground plane in learned depth, over the prior.
     ``seconds`` are those of each step, also where it was not measured, NaN where the camera
     stood or hardly moved.
     """
@@ -316,6 +290,7 @@ class StepEvidence:
     absolute: FloatArray
     absolute_sigma: FloatArray
     learned: FloatArray
+    plane: FloatArray
     seconds: FloatArray
 
     def learned_noise(self) -> float:
@@ -347,10 +322,28 @@ class StepEvidence:
         change = _ACCELERATION_SIGMA * camera_height * duration
         return np.asarray(change / np.maximum(speed[1:], speed[:-1]))
 
+    def contradicted(
+        self, log_length: FloatArray, log_unit: FloatArray, speed_sigma: FloatArray
+    ) -> NDArray[np.bool_]:
+        """Which lengths are not what learned depth says, or change as no vehicle's does ``(S,)``.
+
+        Args:
+            log_length: solved ``(S,)``.
+            log_unit: of learned depth over the prior ``(S,)``.
+            speed_sigma: by `steady_sigma` ``(S - 1,)``.
+        """
+        unit_before = np.concatenate([log_unit[:1], log_unit[:-1]])
+        by_learned = self.learned + unit_before - log_length
+        by_learned /= self.learned_noise() * _LEARNED_SIGMA
+        change = np.diff(log_length) - np.diff(np.log(self.seconds))
+        by_speed = np.concatenate([[np.nan], change / np.hypot(speed_sigma, _LENGTH_SIGMA)])
+        worst = np.fmax(np.abs(by_learned), np.abs(by_speed))
+        return np.asarray(worst > _CONTRADICTION_SIGMAS)
+
     @classmethod
     def empty(cls, steps: int) -> StepEvidence:
         """Without a measurement."""
-        return cls(*(np.full(steps, np.nan) for _ in range(6)))
+        return cls(*(np.full(steps, np.nan) for _ in range(7)))
 
 
 @dataclass(frozen=True)
@@ -375,7 +368,7 @@ def gather_evidence(
     links: Sequence[Ends],
     motions: Mapping[Ends, Motion],
     absolute: Mapping[Ends, tuple[float, float]],
-    prior_unit: FloatArray,
+    prior_unit: float,
 ) -> StepEvidence:
     """All measurements of the lengths of a drive's steps, one row a link.
 
@@ -383,7 +376,7 @@ def gather_evidence(
         links: consecutive steps.
         motions: the measured ones.
         absolute: length in the mode's unit, and its relative sigma.
-        prior_unit: that unit per unscaled length near each frame ``(N,)``.
+        prior_unit: that unit per unscaled length.
     """
     evidence = StepEvidence.empty(len(links))
     before: Motion | None = None
@@ -391,7 +384,7 @@ def gather_evidence(
         motion = motions.get(ends)
         if motion is not None and motion.is_triangulated:
             evidence.seconds[row] = motion.seconds
-            evidence.learned[row] = np.log(motion.length_unscaled * prior_unit[ends[0]])
+            evidence.learned[row] = np.log(motion.length_unscaled * prior_unit)
             if ends in absolute:
                 length, evidence.absolute_sigma[row] = absolute[ends]
                 evidence.absolute[row] = np.log(length)
@@ -419,7 +412,6 @@ def solve_lengths(evidence: StepEvidence, camera_height: float = 1.0) -> StepLen
     lengths, units = 2 * np.arange(steps), 2 * np.arange(steps) + 1
     ratio_sigma = np.hypot(_RATIO_WIDENING * evidence.ratio_sigma, _RATIO_SIGMA)
     noise = evidence.learned_noise()
-    learned_sigma = noise * _LEARNED_SIGMA
     beside_road = np.where(np.isfinite(evidence.absolute), _BESIDE_ROAD, 1.0)
     ones = np.ones(steps)
     steady = np.diff(np.log(evidence.seconds))
@@ -430,7 +422,8 @@ def solve_lengths(evidence: StepEvidence, camera_height: float = 1.0) -> StepLen
         (units[1:], units[:-1], 0.0 * ones[1:], noise * _UNIT_WALK_SIGMA * ones[1:]),
         (lengths[1:], lengths[:-1], evidence.ratio[1:], ratio_sigma[1:]),
         (lengths, zero, evidence.absolute, evidence.absolute_sigma),
-        (lengths, units, evidence.learned, learned_sigma * beside_road),
+        (lengths, units, evidence.learned, noise * _LEARNED_SIGMA * beside_road),
+        (units, zero, evidence.plane, noise**2 * _PLANE_SIGMA * ones),
         # one prior on the unit of the whole drive, divided among its steps
         (units, zero, 0.0 * ones, _UNIT_SIGMA * np.sqrt(steps) * ones),
     ]
@@ -448,7 +441,7 @@ def solve_lengths(evidence: StepEvidence, camera_height: float = 1.0) -> StepLen
     state, weights = np.zeros(2 * steps + 1), np.ones(len(value))
     for iteration in range(_ITERATIONS):
         weights[of_walk] /= max(_FIRST_WALK * 0.5**iteration, 1.0) ** 2
-        information, right = _normal_equations(plus, minus, value, weights / sigma**2, idle)
+        information, right = difference_equations(plus, minus, value, weights / sigma**2, idle)
         state[:-1] = solveh_banded(information, right)
         speed_sigma = evidence.steady_sigma(state[lengths], camera_height)
         sigma[of_speed] = np.where(known[of_speed], speed_sigma, np.inf)
@@ -465,13 +458,7 @@ def solve_lengths(evidence: StepEvidence, camera_height: float = 1.0) -> StepLen
         _CORRELATED_WIDENING * sigmas * np.sqrt((1.0 + correlations) / (1.0 - correlations))
     )
     sigmas, correlated_sigmas = of_measured * sigmas, of_measured * correlated_sigmas
-    unit_before = np.concatenate([log_unit[:1], log_unit[:-1]])
-    by_learned = (evidence.learned + unit_before - log_length) / learned_sigma
-    change = (np.diff(log_length) - steady) / np.hypot(speed_sigma, _LENGTH_SIGMA)
-    by_speed = np.concatenate([[np.nan], change])
-    contradicted = (np.abs(by_learned) > _CONTRADICTION_SIGMAS) | (
-        np.abs(by_speed) > _CONTRADICTION_SIGMAS
-    )
+    contradicted = evidence.contradicted(log_length, log_unit, speed_sigma)
     return StepLengths(
         of_measured * np.exp(log_length), sigmas, correlated_sigmas, np.exp(log_unit), contradicted
     )
@@ -528,26 +515,3 @@ def _from_before(own: FloatArray, coupling: FloatArray) -> FloatArray:
             ]
         )
     return np.array(chain)
-
-
-def _normal_equations(
-    plus: NDArray[np.intp],
-    minus: NDArray[np.intp],
-    value: FloatArray,
-    weights: FloatArray,
-    idle: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """The upper band ``(3, N)`` of the weighted normal matrix with ``idle`` on its diagonal, and the right side.
-
-    Of equations ``state[plus] - state[minus] = value``, ``(M,)`` each; the place behind the last
-    state is zero. None ties states that are more than two places apart.
-    """
-
-    def added(places: NDArray[np.intp], values: FloatArray) -> FloatArray:
-        return np.asarray(np.bincount(places, values, len(idle) + 1)[: len(idle)], np.float64)
-
-    later, apart = np.maximum(plus, minus), np.abs(plus - minus)
-    off_diagonal = (-added(later, np.where(apart == distance, weights, 0.0)) for distance in (2, 1))
-    diagonal = idle + added(plus, weights) + added(minus, weights)
-    right = added(plus, weights * value) - added(minus, weights * value)
-    return np.array([*off_diagonal, diagonal]), right

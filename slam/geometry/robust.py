@@ -1,4 +1,4 @@
-"""Robust statistics: scale by the median absolute deviation, medians with weights, running medians."""
+"""Robust statistics: scale by the median absolute deviation, medians; least squares of states along a drive."""
 
 from __future__ import annotations
 
@@ -40,3 +40,34 @@ def running_median(values: FloatArray, window: int) -> FloatArray:
     around = np.sort(np.lib.stride_tricks.sliding_window_view(padded, window))  # NaN is last
     rows, known = np.arange(len(values)), (~np.isnan(around)).sum(axis=1)
     return np.asarray(0.5 * (around[rows, (known - 1) // 2] + around[rows, known // 2]))
+
+
+def difference_equations(
+    plus: NDArray[np.intp],
+    minus: NDArray[np.intp],
+    value: FloatArray,
+    weights: FloatArray,
+    idle: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """The normal equations of ``state[plus] - state[minus] = value``, as for `scipy.linalg.solveh_banded`.
+
+    Args:
+        plus: places of states ``(M,)``, at most two from those of ``minus``; the place behind the
+            last state is zero.
+        minus: places ``(M,)``.
+        value: of the difference ``(M,)``.
+        weights: inverse variances ``(M,)``.
+        idle: added to the diagonal ``(N,)``.
+
+    Returns:
+        The upper band ``(3, N)`` of the normal matrix, and the right side ``(N,)``.
+    """
+
+    def added(places: NDArray[np.intp], values: FloatArray) -> FloatArray:
+        return np.asarray(np.bincount(places, values, len(idle) + 1)[: len(idle)], np.float64)
+
+    later, apart = np.maximum(plus, minus), np.abs(plus - minus)
+    off_diagonal = (-added(later, np.where(apart == distance, weights, 0.0)) for distance in (2, 1))
+    diagonal = idle + added(plus, weights) + added(minus, weights)
+    right = added(plus, weights * value) - added(minus, weights * value)
+    return np.array([*off_diagonal, diagonal]), right

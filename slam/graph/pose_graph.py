@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
 from typing import Any
@@ -319,30 +318,18 @@ def _pose3(T_a_b: FloatArray) -> Any:
     return gtsam.Pose3(gtsam.Rot3(T_a_b[:3, :3]), T_a_b[:3, 3])
 
 
-@dataclass(frozen=True)
-class RelativeSimilarity:
-    """A measured similarity between two cameras whose units differ: ``p_from = scale R p_to + t``.
-
-    ``T_from_to`` ``(4, 4)`` is in the unit of the first camera, as are the ``sigmas`` ``(7,)`` of
-    rotation and translation; the last sigma is that of the logarithm of the scale.
-    """
-
-    from_index: int
-    to_index: int
-    T_from_to: FloatArray
-    scale: float
-    sigmas: FloatArray
-
-
 def optimise_similarities(
-    T_world_camera: FloatArray, scales: FloatArray, edges: Sequence[RelativeSimilarity]
+    T_world_camera: FloatArray,
+    scales: FloatArray,
+    edges: Sequence[tuple[RelativePose, float, float]],
 ) -> tuple[FloatArray, FloatArray]:
     """Poses and units of cameras, the first one fixed.
 
     Args:
         T_world_camera: start ``(K, 4, 4)``.
         scales: start ``(K,)``: units of the world per unit of each camera.
-        edges: connect all cameras.
+        edges: connect all cameras: a relative pose in the unit of its first camera, the unit of its last one over that,
+            and the sigma of its logarithm.
 
     Returns:
         ``T_world_camera`` ``(K, 4, 4)`` and scales ``(K,)``.
@@ -355,10 +342,10 @@ def optimise_similarities(
         values.insert(k, _similarity(T, float(scale)))
     fixed = gtsam.noiseModel.Isotropic.Sigma(7, _ANCHOR_SIGMA)
     graph.add(gtsam.PriorFactorSimilarity3(0, values.atSimilarity3(0), fixed))
-    for edge in edges:
-        units = np.concatenate([np.ones(3), np.full(3, edge.scale), np.ones(1)])
-        measured, noise = _similarity(edge.T_from_to, edge.scale), robust_noise(edge.sigmas / units)
-        graph.add(gtsam.BetweenFactorSimilarity3(edge.from_index, edge.to_index, measured, noise))
+    for pose, ratio, sigma in edges:
+        noise = robust_noise(np.concatenate([pose.sigmas[:3], pose.sigmas[3:] / ratio, [sigma]]))
+        measured = _similarity(pose.T_from_to, ratio)
+        graph.add(gtsam.BetweenFactorSimilarity3(*pose.ends, measured, noise))
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(_MAX_ITERATIONS)
     try:

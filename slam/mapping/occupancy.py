@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -44,30 +45,6 @@ _TUKEY = 0.12
 # weight of the camera's own tilt, against one of a point at the edge of the neighbourhood
 _TILT_PRIOR = 0.05
 _NEIGHBOURS = 6
-
-
-@dataclass(frozen=True)
-class Ground:
-    """Planes ``z = z0 + slope (x - x0)`` under ``anchors`` ``(A, 3)``, with ``slopes`` ``(A, 2)``; z is up."""
-
-    anchors: FloatArray
-    slopes: FloatArray
-    reach: float
-
-    def heights(self, places: FloatArray) -> FloatArray:
-        """Height of the ground ``(P,)`` under places ``(P, 2)``; NaN far from the drive."""
-        count = min(_NEIGHBOURS, len(self.anchors))
-        distances, nearest = cKDTree(self.anchors[:, :2]).query(places, k=count)
-        distances, nearest = (
-            distances.reshape(len(places), count),
-            nearest.reshape(len(places), count),
-        )
-        offsets = places[:, None] - self.anchors[nearest, :2]
-        planes = self.anchors[nearest, 2] + (self.slopes[nearest] * offsets).sum(axis=2)
-        # neighbours count by their distance beyond the nearest, so that planes go over into each other
-        weights = 1.0 / (distances - distances[:, :1] + 0.05 * self.reach / _REACH)
-        blended = (planes * weights).sum(axis=1) / weights.sum(axis=1)
-        return np.where(distances[:, 0] <= self.reach, blended, np.nan)
 
 
 @dataclass(frozen=True)
@@ -136,14 +113,14 @@ def occupancy_grid(
         at the bottom left ``(2,)``.
     """
     metre = 1.0 if is_metric else 1.0 / _USUAL_CAMERA_HEIGHT_M
-    ground = ground_along(mesh.points, T_world_camera, _USUAL_CAMERA_HEIGHT_M * metre)
+    ground_at = ground_along(mesh.points, T_world_camera, _USUAL_CAMERA_HEIGHT_M * metre)
     grid = Grid.around(mesh.points, resolution)
     shape = (grid.height, grid.width)
     free, occupied = np.zeros(shape).ravel(), np.zeros(shape).ravel()
     for points, areas in samples(mesh, resolution):
         cells = grid.cells(points)
         touched, which = np.unique(cells, return_inverse=True)
-        above = points[:, 2] - ground.heights(grid.centres(touched))[which]
+        above = points[:, 2] - ground_at(grid.centres(touched))[which]
         on_ground = np.abs(above) < OBSTACLE_FROM_M * metre
         standing = (above >= OBSTACLE_FROM_M * metre) & (above <= OBSTACLE_TO_M * metre)
         for total, chosen in ((free, on_ground), (occupied, standing)):
@@ -182,7 +159,9 @@ def samples(mesh: Ply, resolution: float) -> Iterator[tuple[FloatArray, FloatArr
             )
 
 
-def ground_along(points: FloatArray, T_world_camera: FloatArray, camera_height: float) -> Ground:
+def ground_along(
+    points: FloatArray, T_world_camera: FloatArray, camera_height: float
+) -> Callable[[FloatArray], FloatArray]:
     """The ground by points of the map ``(P, 3)``, z up, under cameras ``(N, 4, 4)`` in the same axes.
 
     ``camera_height`` is a first guess, which the map then corrects.
@@ -191,6 +170,9 @@ def ground_along(points: FloatArray, T_world_camera: FloatArray, camera_height: 
         points: of the map ``(P, 3)``, z up.
         T_world_camera: poses of the cameras ``(N, 4, 4)`` in the same axes.
         camera_height: a first guess, in the unit of the points.
+
+    Returns:
+        Its height ``(P,)`` under places ``(P, 2)``; NaN far from the drive.
 
     Raises:
         RunError: the map has no ground below the cameras.
@@ -223,7 +205,23 @@ def ground_along(points: FloatArray, T_world_camera: FloatArray, camera_height: 
         for (near, depth), camera, axis in zip(around(), cameras, up, strict=True)
     ]
     anchors, slopes = map(np.array, zip(*planes))
-    return Ground(anchors, slopes, _REACH * height)
+    return partial(_heights, anchors, slopes, _REACH * height)
+
+
+def _heights(
+    anchors: FloatArray, slopes: FloatArray, reach: float, places: FloatArray
+) -> FloatArray:
+    """By planes ``z = z0 + slope (x - x0)`` under ``anchors`` ``(A, 3)``, with ``slopes`` ``(A, 2)``."""
+    count = min(_NEIGHBOURS, len(anchors))
+    distances, nearest = (
+        each.reshape(len(places), count) for each in cKDTree(anchors[:, :2]).query(places, k=count)
+    )
+    offsets = places[:, None] - anchors[nearest, :2]
+    planes = anchors[nearest, 2] + (slopes[nearest] * offsets).sum(axis=2)
+    # neighbours count by their distance beyond the nearest, so that planes go over into each other
+    weights = 1.0 / (distances - distances[:, :1] + 0.05 * reach / _REACH)
+    blended = (planes * weights).sum(axis=1) / weights.sum(axis=1)
+    return np.where(distances[:, 0] <= reach, blended, np.nan)
 
 
 def write_ros_map(

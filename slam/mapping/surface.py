@@ -66,18 +66,6 @@ class Piece:
     sizes: NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class _Rows:
-    """Rows ``(V,)`` of a piece's vertices in the whole mesh, -1 where they are left out.
-
-    Those from ``begin`` on are its own, the others an earlier piece's. ``triangles`` are kept.
-    """
-
-    numbers: SpilledArray
-    begin: int
-    triangles: int
-
-
 class MapSurface:
     """The cleaned surface of finished submaps."""
 
@@ -113,8 +101,7 @@ class MapSurface:
             progress("mesh", done, len(tiles))
         if not self._pieces:
             raise EmptyMapError("the map is empty: no surface was seen")
-        self._rows = _numbered(self._pieces, _LEAST_TRIANGLES, self._spill)
-        self.triangles = sum(rows.triangles for rows in self._rows)
+        self._rows, self.triangles = _numbered(self._pieces, _LEAST_TRIANGLES, self._spill)
         if self.triangles == 0:
             raise EmptyMapError(
                 f"the map is empty: no piece of surface is larger than {_LEAST_TRIANGLES} triangles"
@@ -128,9 +115,9 @@ class MapSurface:
 
     def vertex_pieces(self) -> Iterator[NDArray[np.void]]:
         """Vertices as records with position, normal, colour and ``filled``, each once, tile by tile."""
-        for piece, rows in zip(self._pieces, self._rows):
-            numbers, first = np.unique(rows.numbers.read(), return_index=True)
-            yield piece.vertices.read()[first[numbers >= rows.begin]]
+        for piece, (rows, begin) in zip(self._pieces, self._rows):
+            numbers, first = np.unique(rows.read(), return_index=True)
+            yield piece.vertices.read()[first[numbers >= begin]]
 
     def cloud_pieces(self) -> Iterator[NDArray[np.void]]:
         """The observed vertices, without the ones that close holes, as records."""
@@ -139,15 +126,15 @@ class MapSurface:
 
     def triangle_pieces(self) -> Iterator[Triangles]:
         """Triangles ``(t, 3)`` of all vertices, tile by tile."""
-        for piece, rows in zip(self._pieces, self._rows):
-            numbered = rows.numbers.read()[piece.triangles.read()]
+        for piece, (rows, _) in zip(self._pieces, self._rows):
+            numbered = rows.read()[piece.triangles.read()]
             yield numbered[numbered[:, 0] >= 0]
 
     def meshes(self) -> Iterator[tuple[FloatArray, Triangles]]:
         """Vertices ``(V, 3)`` and triangles ``(T, 3)`` of each tile by itself."""
-        for piece, rows in zip(self._pieces, self._rows):
+        for piece, (rows, _) in zip(self._pieces, self._rows):
             triangles = piece.triangles.read()
-            kept = rows.numbers.read()[triangles[:, 0]] >= 0
+            kept = rows.read()[triangles[:, 0]] >= 0
             yield Ply(piece.vertices.read()).points, triangles[kept].astype(np.int64)
 
     def write_mesh(self, path: Path) -> None:
@@ -201,8 +188,15 @@ def _piece(patch: TileSurface, painter: Painter, spill: SpillFile) -> Piece:
     )
 
 
-def _numbered(pieces: list[Piece], least_triangles: int, spill: SpillFile) -> list[_Rows]:
-    """Number the vertices of parts of so many triangles in all tiles together; of a shared one, in its first piece."""
+def _numbered(
+    pieces: list[Piece], least_triangles: int, spill: SpillFile
+) -> tuple[list[tuple[SpilledArray, int]], int]:
+    """Number the vertices of parts of so many triangles in all tiles together; of a shared one, in its first piece.
+
+    Returns:
+        Of each piece the rows ``(V,)`` of its vertices in the whole mesh, -1 where they are left out, and the first
+        that is its own: those before are an earlier piece's. And how many triangles are kept.
+    """
     begin = np.cumsum([0, *(len(piece.sizes) for piece in pieces)])
     points = np.concatenate([piece.shared_points for piece in pieces])
     part = np.concatenate([first + piece.shared_labels for first, piece in zip(begin, pieces)])
@@ -218,7 +212,7 @@ def _numbered(pieces: list[Piece], least_triangles: int, spill: SpillFile) -> li
         >= least_triangles
     )
     row_of_group = np.full(len(earliest), -1)
-    rows, place, written = [], 0, 0
+    rows, place, written, triangles = [], 0, 0, 0
     for first, last, piece in zip(begin, begin[1:], pieces):
         own = kept_part[first + piece.label.read()]
         numbers = np.full(len(own), -1)
@@ -230,11 +224,10 @@ def _numbered(pieces: list[Piece], least_triangles: int, spill: SpillFile) -> li
         numbers[own] = np.arange(written, written + count)
         row_of_group[groups[is_first]] = numbers[firsts]
         numbers[other] = row_of_group[groups[~is_first]]
-        rows.append(
-            _Rows(spill.put(numbers), written, int(piece.sizes[kept_part[first:last]].sum()))
-        )
+        rows.append((spill.put(numbers), written))
+        triangles += int(piece.sizes[kept_part[first:last]].sum())
         place, written = place + len(groups), written + count
-    return rows
+    return rows, triangles
 
 
 @dataclass(frozen=True)

@@ -230,10 +230,10 @@ class Slam:
             ErfsfmError: as ``DepthPosePredictor.from_weights``.
         """
         _require_possible(intrinsics, camera_height_m)
-        prediction = open_prediction(
+        predictor, *_ = open_prediction(
             name_or_dir, device, (config or SlamConfig()).depth, intrinsics
         )
-        return cls(prediction.predictor, intrinsics, config, camera_height_m, with_map=with_map)
+        return cls(predictor, intrinsics, config, camera_height_m, with_map=with_map)
 
     def __len__(self) -> int:
         """Number of frames so far."""

@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from slam.frames import Intrinsics, TrackingEvent, View
-from slam.frontend.factors import scaled_poses
+from slam.frames import KEYFRAME_SOURCE, Intrinsics, RelativePose, TrackingEvent, View
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.frontend.keyframes.submaps import join
 from slam.frontend.scale import Scale
 from slam.geometry.se3 import FloatArray, invert, make, path_distance
-from slam.graph.pose_graph import RelativeSimilarity, optimise_similarities
+from slam.graph.pose_graph import optimise_similarities
 from slam.loops.closure import LoopClosures, Track, find_loops, most_inliers_first
 from slam.loops.verification import OF_KEYFRAMES, Loop, LoopVerifier
 
@@ -50,10 +49,9 @@ class MapClosure:
 
     def closures(self, scale: Scale) -> LoopClosures:
         """The loops in the unit of the scale, the accepted ones by the relative poses of the closed maps."""
-        scaled = scaled_poses(self.poses.loops, self.poses, scale)
         accepted = [
-            replace(loop, measured=pose)
-            for pose, loop in zip(scaled, self.loops.accepted, strict=True)
+            replace(loop, measured=scale.scaled(pose))
+            for pose, loop in zip(self.poses.loops, self.loops.accepted, strict=True)
         ]
         return replace(self.loops, accepted=tuple(accepted))
 
@@ -215,15 +213,12 @@ def _joined(
             if rows.maps[row] == rows.maps[chosen[last]]:
                 T_step = invert(rows.T_map_camera[row]) @ rows.T_map_camera[chosen[last]]
                 length = _RELATIVE_SIGMA * float(np.linalg.norm(T_step[:3, 3])) + _LEAST_SIGMA
-                sigmas = np.concatenate(
-                    [np.full(3, _ROTATION_SIGMA), np.full(3, length), [_SCALE_SIGMA]]
-                )
-                edges.append(RelativeSimilarity(first, last, T_step, 1.0, sigmas))
+                sigmas = np.repeat([_ROTATION_SIGMA, length], 3)
+                pose = RelativePose(first, last, T_step, sigmas, KEYFRAME_SOURCE)
+                edges.append((pose, 1.0, _SCALE_SIGMA))
     for loop, (earlier, later) in zip(loops, place[rows.track.rows(loops)].tolist(), strict=True):
-        sigmas = np.append(loop.measured.sigmas, _LOOP_SCALE_SIGMA)
-        edges.append(
-            RelativeSimilarity(earlier, later, loop.measured.T_from_to, loop.scale, sigmas)
-        )
+        pose = replace(loop.measured, from_index=earlier, to_index=later)
+        edges.append((pose, loop.scale, _LOOP_SCALE_SIGMA))
         shared.append((earlier, later, loop.corners))
     T, scales = optimise_similarities(T[chosen], scales[chosen], edges)
     return join([rows.segments[member] for member in members], T, scales, shared, intrinsics)

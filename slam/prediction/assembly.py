@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -92,15 +91,6 @@ def open_depth(
     return DepthFolder(config, numbers, intrinsics.width, intrinsics.height, undistort)
 
 
-@dataclass(frozen=True)
-class Prediction:
-    """Networks, the source of depth where that is another, and both as the predictor of a run."""
-
-    networks: DepthPosePredictor
-    source: DepthSource | None
-    predictor: Predictor
-
-
 def open_prediction(
     weights: str | Path,
     device: str,
@@ -108,7 +98,7 @@ def open_prediction(
     intrinsics: Intrinsics,
     numbers: FrameNumbers | None = None,
     undistort: Undistort | None = None,
-) -> Prediction:
+) -> tuple[Predictor, DepthPosePredictor, DepthSource | None]:
     """Networks by the name of shipped weights or a training output folder, with depth as configured.
 
     Args:
@@ -120,6 +110,9 @@ def open_prediction(
         undistort: what is done with the images as they are read, for depth files of the stored
             ones.
 
+    Returns:
+        The predictor of a run, its networks, and the source of its depth where that is another.
+
     Raises:
         SlamError: as `open_depth`.
         ErfsfmError: as ``DepthPosePredictor.from_weights``.
@@ -127,6 +120,5 @@ def open_prediction(
     source = open_depth(depth, intrinsics, numbers, undistort)
     networks = DepthPosePredictor.from_weights(weights, device, "onnx")
     own = NetworkPredictor(networks, intrinsics)
-    return Prediction(
-        networks, source, own if source is None else SourcedPredictor(own, source, depth.align)
-    )
+    predictor = own if source is None else SourcedPredictor(own, source, depth.align)
+    return predictor, networks, source

@@ -1,14 +1,11 @@
-"""GPS tracks of the user: CSV with a header, or NMEA 0183."""
+"""GPS tracks of the user: CSV with a header."""
 
 from __future__ import annotations
 
 import csv
 import math
 import re
-from collections.abc import Iterable
 from datetime import UTC, datetime
-from functools import reduce
-from operator import xor
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +32,6 @@ _SPEED_UNITS = {
 }
 _MOST_SPEED_RATIO = 1.5  # of stated speeds and those of the fixes; units differ by more
 _LEAST_SPEED_M_S = 5.0  # at which fixes a second apart tell a unit
-_DAY_S = 86400.0
 _EARTH_RADIUS_M = 6.371e6
 FASTEST_M_S = 300.0
 _LEAST_FIXES = 3  # one step may be an error of one fix
@@ -48,28 +44,24 @@ def read_gps(path: Path) -> GpsTrack:
 
     CSV has a header with ``stamp`` in seconds on the clock of the images (times as in ISO 8601 become seconds since
     1970), ``latitude`` and ``longitude`` in degrees and, optionally, ``altitude`` in metres, ``hdop`` and a speed whose
-    name says its unit (``speed_kmh``; metres a second without one). Of NMEA, GGA sentences with an altitude are read;
-    their stamps are seconds of the first day.
+    name says its unit (``speed_kmh``; metres a second without one).
 
     Raises:
         SequenceError: the file cannot be read, holds no fix, moves at an impossible speed, or states
             speeds that are not those of its fixes.
     """
     text = text_of(path, SequenceError, "a GPS track")
-    if text.lstrip().startswith("<"):
+    if text.lstrip().startswith(("<", "$")):
         raise SequenceError(
-            f"{path} is XML, such as GPX, which is not read: convert it to CSV ({','.join(_NEEDED)}) or to NMEA"
+            f"{path} is XML, such as GPX, or NMEA, which are not read: convert it to CSV ({','.join(_NEEDED)})"
         )
-    lines = text.splitlines()
     try:
-        found = _nmea_rows(lines) if text.lstrip().startswith("$") else _csv_rows(lines, path)
+        found = _fixes(text.splitlines(), path)
     except csv.Error as error:
         raise SequenceError(f"{path} cannot be read as a GPS track: {error}") from error
     if not found:
-        wrong = sum("*" in line and _sentence(line) == [""] for line in lines)
         raise SequenceError(
-            f"{path} holds no GPS fix: CSV with a header {','.join(_NEEDED)}, or NMEA with altitudes is read"
-            + (f"; {wrong} sentences have a wrong checksum" if wrong else "")
+            f"{path} holds no GPS fix: CSV with a header {','.join(_NEEDED)} is read"
         )
     bad, rows = BadRows(path, SequenceError), np.array([row for row, _ in found], np.intp)
     table = np.array([fix for _, fix in found], dtype=np.float64)
@@ -103,7 +95,7 @@ def read_gps(path: Path) -> GpsTrack:
     return GpsTrack(table[:, 0], table[:, 1:4], table[:, 4], table[:, 5])
 
 
-def _csv_rows(lines: list[str], path: Path) -> list[tuple[int, list[float]]]:
+def _fixes(lines: list[str], path: Path) -> list[tuple[int, list[float]]]:
     """Lines with stamp, latitude, longitude, altitude, dilution, speed in m/s.
 
     NaN where a row is no fix, and where a track has no altitude or no speed.
@@ -148,41 +140,3 @@ def _seconds(word: str) -> float:
         return seconds
     moment = datetime.fromisoformat(word.strip())
     return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
-
-
-def _nmea_rows(lines: Iterable[str]) -> list[tuple[int, list[float]]]:
-    """The same of GGA sentences with a fix and its altitude; each receiver repeats a fix at most once a stamp."""
-    rows: list[tuple[int, list[float]]] = []
-    before = -math.inf
-    for number, line in enumerate(lines, start=1):
-        words = _sentence(line)
-        if words[0][-3:] != "GGA" or len(words) < 10 or words[6] in ("", "0") or not words[9]:
-            continue
-        try:
-            clock = words[1]
-            stamp = 3600 * int(clock[:2]) + 60 * int(clock[2:4]) + float(clock[4:])
-            if stamp < before - _DAY_S / 2:
-                stamp += _DAY_S
-            place = _degrees(words[2], words[3]), _degrees(words[4], words[5]), float(words[9])
-            fix = [stamp, *place, float(words[8] or 1.0), math.nan]
-        except ValueError:
-            fix = _NO_FIX
-        if fix[0] != before:
-            rows.append((number, fix))
-        before = before if math.isnan(fix[0]) else fix[0]
-    return rows
-
-
-def _sentence(line: str) -> list[str]:
-    """The words of an NMEA sentence, one empty word where its checksum is wrong."""
-    body, star, checksum = line.strip().lstrip("$").partition("*")
-    if star and checksum.upper() != f"{reduce(xor, body.encode(), 0):02X}":
-        return [""]
-    return body.split(",")
-
-
-def _degrees(word: str, side: str) -> float:
-    """Degrees of ``DDMM.MMM`` or ``DDDMM.MMM``, negative south and west."""
-    point = word.index(".") if "." in word else len(word)
-    degrees = int(word[: point - 2]) + float(word[point - 2 :]) / 60.0
-    return -degrees if side in ("S", "W") else degrees

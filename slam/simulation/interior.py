@@ -11,20 +11,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.simulation.furniture import CLOTHS, PAINTS, STANDING, TALL, WOODS, Piece, dining
-from slam.simulation.geometry import FLAT, FloatArray, Material, Soup
-from slam.simulation.shapes import Rectangle, colour, frame_at, plate, solid
+from slam.simulation.furniture import STANDING, TALL, Piece, dining
+from slam.simulation.geometry import FLAT, FloatArray, luck
+from slam.simulation.shapes import UP, Rectangle, Site, lattice
 
 WALL = 0.14  # thickness, metres
 KINDS = ("living", "kitchen", "office", "bedroom", "bath", "office")
 DOOR_HEIGHT = 2.1
-_WALLS = (
-    (0.86, 0.84, 0.79),
-    (0.80, 0.82, 0.84),
-    (0.78, 0.72, 0.60),
-    (0.66, 0.72, 0.68),
-    (0.74, 0.62, 0.56),
-)
 _AISLE = 1.0  # left free between the furniture at the walls and the table in the middle, metres
 _DEEPEST = 0.65  # piece at a wall, metres
 _STEP = 0.5  # between the vertices of walls, which carry the light, metres
@@ -78,35 +71,27 @@ class House:
 
 def draw_house(seed: int) -> House:
     """The plan of a world."""
-    rng = np.random.default_rng([seed, 50])
-    length, width = float(rng.uniform(14.0, 20.0)), float(rng.uniform(1.9, 2.4))
-    height = float(rng.uniform(2.45, 2.9))
+    rng = luck(seed, 50)
+    length, width, height = rng.uniform((14.0, 1.9, 2.45), (20.0, 2.4, 2.9)).tolist()
     corridor = Room("corridor", (0.0, 0.0, length, width), height, (3,))
-    wide, deep = float(rng.uniform(9.0, 13.0)), float(rng.uniform(7.5, 10.0))
-    hall_x, hall_y = length + WALL, 0.5 * width - deep * float(rng.uniform(0.35, 0.65))
-    hall = Room(
-        "hall",
-        (hall_x, hall_y, hall_x + wide, hall_y + deep),
-        float(rng.uniform(3.8, 5.0)),
-        (0, 1, 2),
-    )
+    wide, deep = rng.uniform(9.0, 13.0), rng.uniform(7.5, 10.0)
+    hall_x, hall_y = length + WALL, 0.5 * width - deep * rng.uniform(0.35, 0.65)
+    area = (hall_x, hall_y, hall_x + wide, hall_y + deep)
+    hall = Room("hall", area, rng.uniform(3.8, 5.0), (0, 1, 2))
     rooms, doors = [corridor, hall], [(length, 0.5 * width - 0.8, hall_x, 0.5 * width + 0.8)]
     kinds = list(rng.permutation(KINDS)) + list(rng.permutation(KINDS))
     for north in (False, True):
         start, before = 0.0, None
         while length - start > 3.2:
-            end = start + float(rng.uniform(3.4, 6.0))
+            end = start + rng.uniform(3.4, 6.0)
             end = length if length - end < 3.4 + WALL else end
-            depth = float(rng.uniform(3.4, 5.5))
+            depth = rng.uniform(3.4, 5.5)
             low, high = (width + WALL, width + WALL + depth) if north else (-WALL - depth, -WALL)
-            rooms.append(
-                Room(str(kinds.pop()), (start, low, end, high), height, (2,) if north else (0,))
-            )
-            door = start + float(rng.uniform(0.75, end - start - 1.85))
-            opening = float(rng.uniform(0.95, 1.1))
-            doors.append(
-                (door, width, door + opening, low) if north else (door, -WALL, door + opening, 0.0)
-            )
+            kind, outside = str(kinds.pop()), (2,) if north else (0,)
+            rooms.append(Room(kind, (start, low, end, high), height, outside))
+            door = start + rng.uniform(0.75, end - start - 1.85)
+            wall = (width, low) if north else (high, 0.0)
+            doors.append((door, wall[0], door + rng.uniform(0.95, 1.1), wall[1]))
             if before is not None and rng.random() < 0.5:
                 middle = width + WALL + 1.2 if north else -WALL - 2.2
                 doors.append((before, middle, start, middle + 1.0))
@@ -126,42 +111,39 @@ class Interior:
 
     def __init__(self, seed: int) -> None:
         """The house of a world."""
-        self.rng = rng = np.random.default_rng([seed, 51])
-        self.house, self.soup = draw_house(seed), Soup(rng)
+        self.rng = rng = luck(seed, 51)
+        self.house, self.site = draw_house(seed), Site(rng)
         self.obstacles: list[Rectangle] = []
         self._lights: list[tuple[float, float, float, float]] = []
-        self.frame_look = self.soup.instance(Material.WOOD, colour(rng, *WOODS))
-        self.skirting = colour(rng, (0.85, 0.84, 0.80), *WOODS)
+        self.frame_look = self.site.instance("wood", "wood")
+        self.skirting = self.site.colour("skirting")
         for room in self.house.rooms:
             self._enclose_and_fill(room)
         for door in self.house.doors:
             self._doorway(door)
-        self.mesh, self.lights = self.soup.finish(FLAT), np.array(self._lights)
+        self.mesh, self.lights = self.site.finish(FLAT), np.array(self._lights)
 
     def _enclose_and_fill(self, room: Room) -> None:
         """Everything inside the walls of a room."""
-        rng, (x0, y0, x1, y1) = self.rng, room.area
+        rng, site, (x0, y0, x1, y1) = self.rng, self.site, room.area
         east, north = np.array([x1 - x0, 0.0, 0.0]), np.array([0.0, y1 - y0, 0.0])
         if room.kind in ("living", "bedroom", "office"):
-            floor = self.soup.instance(
-                Material.BOARDS, colour(rng, *WOODS), None, (rng.uniform(0.07, 0.16),)
-            )
+            tone = site.colour("wood")
+            floor = site.instance("boards", tone, 1.0, (rng.uniform(0.07, 0.16),))
         else:
-            side = float(rng.uniform(0.9, 1.3) if room.kind == "hall" else rng.uniform(0.2, 0.5))
-            tone = colour(rng, (0.62, 0.60, 0.57), (0.50, 0.51, 0.53), (0.68, 0.58, 0.46))
-            chequered = float(room.kind in ("bath", "kitchen") and rng.random() < 0.4)
-            floor = self.soup.instance(Material.TILES, tone, 0.75 * tone, (side, 0.008, chequered))
+            side = rng.uniform(0.9, 1.3) if room.kind == "hall" else rng.uniform(0.2, 0.5)
+            tone = site.colour("floor tiles")
+            chequered = room.kind in ("bath", "kitchen") and rng.random() < 0.4
+            floor = site.instance("tiles", tone, 0.75, (side, 0.008, chequered))
         self._panel(np.array([x0, y0, 0.0]), east, north, floor)
-        ceiling = self.soup.instance(Material.PLASTER, colour(rng, (0.88, 0.88, 0.86), spread=0.02))
+        ceiling = site.instance("plaster", "ceiling")
         self._panel(np.array([x0, y0, room.height]), north, east, ceiling)
-        tone = colour(rng, *_WALLS, spread=0.04)
+        tone = site.colour("wall")
         if room.kind == "bath":
-            wall = self.soup.instance(
-                Material.TILES, tone, 0.8 * tone, (float(rng.uniform(0.1, 0.25)), 0.006)
-            )
+            wall = site.instance("tiles", tone, 0.8, (rng.uniform(0.1, 0.25), 0.006))
         else:
-            papered = float(rng.uniform(0.1, 0.3)) if rng.random() < 0.2 else 0.0
-            wall = self.soup.instance(Material.PLASTER, tone, self.skirting, (0.08, papered, 0.08))
+            papered = rng.uniform(0.1, 0.3) if rng.random() < 0.2 else 0.0
+            wall = site.instance("plaster", tone, self.skirting, (0.08, papered, 0.08))
         for number in range(4):
             self._furnish(room, number, wall)
         self._fill_middle(room)
@@ -172,7 +154,7 @@ class Interior:
         x0, y0, x1, y1 = door
         east = np.array([x1 - x0, 0, 0])
         north = np.array([0, y1 - y0, 0])
-        up = np.array([0, 0, DOOR_HEIGHT])
+        up = DOOR_HEIGHT * UP
         corner = np.array([x0, y0, 0.0])
         if x1 - x0 > WALL + 0.01:
             jambs = (corner, north), (corner + east + north, -north)
@@ -180,7 +162,7 @@ class Interior:
             jambs = (corner + east, -east), (corner + north, east)
         lintel, threshold = (corner + up, north, east), (corner, east, north)
         for quad in (*((foot, along, up) for foot, along in jambs), lintel, threshold):
-            self.soup.quad(*quad, self.frame_look)
+            self.site.quad(*quad, self.frame_look)
 
     def _panel(self, corner: FloatArray, along: FloatArray, up: FloatArray, look: int) -> None:
         """A parallelogram, vertices at most ``_STEP`` apart, textured in metres from its corner."""
@@ -189,29 +171,25 @@ class Interior:
             np.linspace(0.0, 1.0, int(np.ceil(extent / _STEP)) + 1) for extent in (width, height)
         )
         points = corner + a[None, :, None] * along + b[:, None, None] * up
-        u, v = np.meshgrid(a * width, b * height + corner[2] * (up[2] > 0.0))
-        self.soup.patch(points, np.stack([u, v], axis=2), look)
+        uv = lattice(a * width, b * height + corner[2] * (up[2] > 0.0))
+        self.site.patch(points, uv, look)
 
     def _furnish(self, room: Room, number: int, wall: int) -> None:
         """One wall around its doors, seen from inside, with windows, furniture and pictures."""
         rng, openings = self.rng, self.house.openings(room, number)
         (x, y), angle, length = room.side(number)
-        ahead, up = np.array([np.cos(angle), np.sin(angle), 0.0]), np.array([0.0, 0.0, 1.0])
+        foot = self.site.at(x, y, angle)
         for k, (start, end) in enumerate(pairwise([0.0, *np.ravel(openings), length])):
             low = DOOR_HEIGHT * (k % 2)
-            self._panel(
-                np.array([x, y, low]) + end * ahead,
-                (start - end) * ahead,
-                (room.height - low) * up,
-                wall,
-            )
+            corner = foot.moved(end, up=low).origin
+            self._panel(corner, (start - end) * foot.frame[0], (room.height - low) * UP, wall)
         doors = [(a - 0.35, b + 0.35) for a, b in openings]
         windows = self._windows(room, number)
         density = {"corridor": 0.15, "hall": 0.7, "bath": 0.6}.get(room.kind, 0.8)
         pieces = STANDING[room.kind]
         left = 0.7
         while True:
-            piece, width, depth = pieces[rng.integers(len(pieces))]
+            piece, width = pieces[rng.integers(len(pieces))]
             width = min(width, length - 0.05 - left)
             if width < 0.6:
                 return
@@ -220,42 +198,36 @@ class Interior:
                 left = max(blocked) + 0.02
                 continue
             daylight = any(a < left + width and b > left for a, b in windows)
-            frame = frame_at(x, y, angle)
-            frame[3] += left * frame[0] + 0.01 * frame[1]
+            place = foot.moved(left, 0.01)
             stands = rng.random() < density and not (daylight and piece in TALL)
             if stands:
-                self._place(piece, frame, width, depth)
+                self._place(piece, place, width)
             if not daylight and not (stands and piece in TALL) and rng.random() < 0.6:
-                self._hang(frame, width)
-            left += width + float(rng.uniform(0.05, 0.5))
+                self._hang(place, width)
+            left += width + rng.uniform(0.05, 0.5)
 
-    def _place(self, piece: Piece, frame: FloatArray, width: float, depth: float) -> None:
-        piece(self.soup, self.rng, frame, width)
-        corners = np.stack([frame[3], frame[3] + width * frame[0] + depth * frame[1]])
+    def _place(self, piece: Piece, place: Site, width: float) -> None:
+        depth = piece(place, width)
+        corners = np.stack([place.origin, place.moved(width).moved(0.0, depth).origin])
         self.obstacles.append((*corners.min(axis=0)[:2], *corners.max(axis=0)[:2]))
 
-    def _hang(self, frame: FloatArray, width: float) -> None:
+    def _hang(self, place: Site, width: float) -> None:
         """A picture, a poster, a mirror or a screen at the height of the eyes."""
         rng = self.rng
-        across, high = float(rng.uniform(0.4, min(width, 1.2))), float(rng.uniform(0.4, 0.8))
-        first, second = colour(rng, *PAINTS), colour(rng, *CLOTHS)
+        across, high = rng.uniform(0.4, min(width, 1.2)), rng.uniform(0.4, 0.8)
+        first, second = place.colour("paint"), place.colour("cloth")
         kind = rng.random()
         if kind < 0.75:
-            look = self.soup.instance(
-                Material.PICTURE, first, second, (across, high, float(rng.integers(3)))
-            )
+            size = across, high, float(rng.integers(3))
+            look = place.instance("picture", first, second, size)
         elif kind < 0.9:
-            look = self.soup.instance(Material.SCREEN, first, second, (across, high))
+            look = place.instance("screen", first, second, (across, high))
         else:
-            look = self.soup.instance(
-                Material.PANE, np.array([0.72, 0.76, 0.78]), self.skirting, (across, high, 0.0)
-            )
-        low = (
-            float(rng.uniform(0.0, width - across)),
-            0.0,
-            1.6 - 0.5 * high + float(rng.uniform(-0.1, 0.15)),
-        )
-        plate(self.soup, frame, low, (across, 0.02, high), look, self.frame_look)
+            mirror = (0.72, 0.76, 0.78)
+            look = place.instance("pane", mirror, self.skirting, (across, high))
+        left = rng.uniform(0.0, width - across)
+        low = (left, 0.0, 1.6 - 0.5 * high + rng.uniform(-0.1, 0.15))
+        place.plate(low, (across, 0.02, high), look, self.frame_look)
 
     def _windows(self, room: Room, number: int) -> list[tuple[float, float]]:
         """Panes in an outside wall, which light the room; where they begin and end along it."""
@@ -264,61 +236,59 @@ class Interior:
         rng = self.rng
         (x, y), angle, length = room.side(number)
         low, high = (1.6, 1.6) if room.kind == "hall" else (0.95, 1.2)
-        width = min(float(rng.uniform(1.0, 1.7)), length - 0.4)
-        spans, left = [], float(rng.uniform(0.2, 0.9))
+        width = min(rng.uniform(1.0, 1.7), length - 0.4)
+        spans, left = [], rng.uniform(0.2, 0.9)
+        place = self.site.at(x, y, angle)
         while left + width < length - 0.1:
-            frame = frame_at(x, y, angle)
-            sky = np.array([0.86, 0.92, 0.98]) * float(rng.uniform(0.9, 1.05))
-            pane = self.soup.instance(Material.PANE, sky, self.skirting, (width, high, 1.0))
-            plate(self.soup, frame, (left, 0.0, low), (width, 0.01, high), pane, self.frame_look)
-            x_light, y_light, _ = frame[3] + (left + 0.5 * width) * frame[0] + 0.8 * frame[1]
+            sky = np.array([0.86, 0.92, 0.98]) * rng.uniform(0.9, 1.05)
+            pane = place.instance("pane", sky, self.skirting, (width, high, 1.0))
+            place.plate((left, 0.0, low), (width, 0.01, high), pane, self.frame_look)
+            x_light, y_light, _ = place.moved(left + 0.5 * width).moved(0.0, 0.8).origin
             strength = (0.35 if room.kind == "hall" else 0.7) * width * high
             self._lights.append((x_light, y_light, low + 0.6 * high, strength))
             spans.append((left, left + width))
-            left += width + float(rng.uniform(0.5, 2.5))
+            left += width + rng.uniform(0.5, 2.5)
         return spans
 
     def _fill_middle(self, room: Room) -> None:
         """A table or a carpet; rows of racks in the hall."""
         rng, (x0, y0, x1, y1) = self.rng, room.area
         low = np.array([x0, y0]) + _DEEPEST + _AISLE
-        free = np.array([x1, y1]) - _DEEPEST - _AISLE - low
+        high = np.array([x1, y1]) - _DEEPEST - _AISLE
+        free = high - low
         if room.kind == "hall":
             for y in np.arange(low[1], low[1] + free[1] - 0.5, 0.6 + 1.5):
                 left = low[0]
-                while left < x1 - _DEEPEST - _AISLE - 1.0:
-                    piece, width, depth = STANDING["hall"][rng.integers(3)]
-                    width = min(width, x1 - _DEEPEST - _AISLE - left)
-                    self._place(piece, frame_at(left, float(y), 0.0), width, depth)
-                    left += width + float(rng.choice([0.05, 1.3], p=[0.6, 0.4]))
+                while left < high[0] - 1.0:
+                    piece, width = STANDING["hall"][rng.integers(3)]
+                    width = min(width, high[0] - left)
+                    self._place(piece, self.site.at(left, y), width)
+                    left += width + rng.choice([0.05, 1.3], p=[0.6, 0.4])
             return
         if room.kind in ("living", "bedroom", "office") and free.min() > 0.2:
             size = np.minimum(free + 1.0, 2.6)
-            tone, other = colour(rng, *CLOTHS), colour(rng, *PAINTS)
-            carpet = self.soup.instance(
-                Material.CARPET, tone, other, (size[0], size[1], float(rng.uniform(0.2, 0.5)))
-            )
+            tones = self.site.colour("cloth"), self.site.colour("paint")
+            motif = rng.uniform(0.2, 0.5)
+            carpet = self.site.instance("carpet", *tones, (*size, motif))
             corner = np.array([*(low + 0.5 * (free - size)), 0.01])
-            self.soup.quad(corner, np.array([size[0], 0, 0]), np.array([0, size[1], 0]), carpet)
+            self.site.quad(corner, np.array([size[0], 0, 0]), np.array([0, size[1], 0]), carpet)
         if free[0] > 0.8 and free[1] > 1.2 and rng.random() < 0.8:
             width, depth = min(free[0], 1.8), min(free[1] - 0.6, 0.9)
             x, y = low + 0.5 * (free - np.array([width, depth]))
-            dining(self.soup, rng, frame_at(float(x), float(y), 0.0), width, depth)
-            self.obstacles.append(
-                (float(x), float(y) - 0.3, float(x) + width, float(y) + depth + 0.3)
-            )
+            dining(self.site.at(x, y), width, depth)
+            self.obstacles.append((x, y - 0.3, x + width, y + depth + 0.3))
 
     def _lamps(self, room: Room) -> None:
         """Flat lamps below the ceiling, about 3 m apart."""
         rng, (x0, y0, x1, y1) = self.rng, room.area
-        bulb = self.soup.instance(Material.LAMP, np.array([1.0, 0.98, 0.92]))
-        strength = (0.8 if room.kind == "hall" else 1.0) * float(rng.uniform(0.8, 1.2))
+        bulb = self.site.instance("lamp", (1.0, 0.98, 0.92))
+        strength = (0.8 if room.kind == "hall" else 1.0) * rng.uniform(0.8, 1.2)
         across, along = (max(1, round(extent / 3.4)) for extent in (x1 - x0, y1 - y0))
         for x in x0 + (np.arange(across) + 0.5) / across * (x1 - x0):
             for y in y0 + (np.arange(along) + 0.5) / along * (y1 - y0):
-                frame = frame_at(x - 0.25, y - 0.15, 0.0, room.height - 0.06)
-                solid(self.soup, frame, (0, 0, 0.001), (0.5, 0.3, 0.05), bulb)
-                self._lights.append((float(x), float(y), room.height - 0.3, strength))
+                lamp = self.site.at(x - 0.25, y - 0.15, z=room.height - 0.06)
+                lamp.solid((0, 0, 0.001), (0.5, 0.3, 0.05), bulb)
+                self._lights.append((x, y, room.height - 0.3, strength))
 
 
 # which several motions and hazards share

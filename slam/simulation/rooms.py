@@ -8,12 +8,13 @@ from numpy.typing import NDArray
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
 from slam.simulation.carried import Carried, Floor
-from slam.simulation.geometry import Float32Array, FloatArray, Material, Mesh, Moving
+from slam.simulation.geometry import MATERIALS, Float32Array, FloatArray, Mesh, luck
 from slam.simulation.interior import interior_of
 from slam.simulation.irradiance import irradiance_of
 from slam.simulation.objects import person
 from slam.simulation.options import SimulationOptions
 from slam.simulation.room_textures import GLOWING
+from slam.simulation.shapes import Moving
 from slam.simulation.world import (
     SHUTTER,
     Hits,
@@ -34,8 +35,8 @@ _GREY = 0.4  # brightness that exposure aims at
 _LONGEST_S = 0.02  # exposure in the light
 _METER_S = 0.1  # the meter's period
 _METERED = 12  # how often it is read
-_METER_WEIGHT = float(np.exp(-_METER_S * np.arange(_METERED) / 0.35).sum())
-_GLOW = np.array([GLOWING.get(material, 0.0) for material in Material], dtype=np.float32)
+_METER_WEIGHTS = np.exp(-_METER_S * np.arange(_METERED) / 0.35)  # the newest reading first
+_GLOW = np.array([GLOWING.get(material, 0.0) for material in MATERIALS], dtype=np.float32)
 
 
 class SimulatedRooms(SimulatedWorld):
@@ -49,31 +50,26 @@ class SimulatedRooms(SimulatedWorld):
         """
         if options.frames < 2:
             raise SequenceError(f"a walk needs at least 2 frames; got {options.frames}")
-        self._interior = interior_of(options.seed)
+        self.options, self._interior = options, interior_of(options.seed)
         floor = Floor(self._interior, options.seed)
         seconds = options.frames / options.rate + _AHEAD_S + 1.0
-        motions = _PEOPLE if "people" in options.hazards else 1
+        peopled = "people" in options.hazards
         self._carried = Carried(
             floor, options.motion or "walk", seconds, options.rate, options.seed
         )
         self._walks = [
             Carried(floor, "walk", seconds, options.rate, options.seed + 1000 * k)
-            for k in range(1, motions)
+            for k in range(1, _PEOPLE * peopled)
         ]
-        rng = np.random.default_rng([options.seed, 57])
-        crowd = [
-            lambda soup: person(soup, rng, 0.0, 0.0)
-        ] * _PEOPLE  # around their own origins, looking along x
-        self._people = Moving(rng, crowd) if "people" in options.hazards else None
+        rng = luck(options.seed, 57)
+        # around their own origins, looking along x
+        self._people = Moving(rng, [person] * _PEOPLE) if peopled else None
         fov = options.fov_deg or _USUAL_FOV_DEG
         if options.varied and options.fov_deg is None:
-            fov = float(
-                np.exp(np.random.default_rng([options.seed, 55]).uniform(*np.log(_VARIED_FOV_DEG)))
-            )
-        T_scene_camera = self._carried.poses(
-            self._moments(np.arange(options.frames) / options.rate, options)
-        )
-        super().__init__(options, square_camera(options.width, options.height, fov), T_scene_camera)
+            fov = float(np.exp(luck(options.seed, 55).uniform(*np.log(_VARIED_FOV_DEG))))
+        moments = self._moments(np.arange(options.frames) / options.rate)
+        camera = square_camera(options.width, options.height, fov)
+        super().__init__(options, camera, self._carried.poses(moments))
 
     def _build(self) -> Mesh:
         return self._interior.mesh
@@ -82,31 +78,28 @@ class SimulatedRooms(SimulatedWorld):
     def _irradiance(self) -> Float32Array:
         return irradiance_of(self.options.seed, "exposure" in self.options.hazards)
 
-    def _moments(self, seconds: FloatArray, options: SimulationOptions) -> FloatArray:
+    def _moments(self, seconds: FloatArray) -> FloatArray:
         """Where in the motion the camera is at times ``(N,)``: it may be put down halfway."""
-        if "stop" not in options.hazards:
+        if "stop" not in self.options.hazards:
             return seconds
-        middle = 0.5 * max(options.frames / options.rate - STILL_S, 0.0)
+        middle = 0.5 * max(len(self) / self.options.rate - STILL_S, 0.0)
         return seconds - np.clip(seconds - middle, 0.0, STILL_S)
 
     def _exposures(self, index: int) -> FloatArray:
         options = self.options
         offsets = np.zeros((1, 1))
         if "blur" in options.hazards:
-            turned = np.diff(self._T_scene_camera[max(index - 1, 0) : index + 2, :3, 2], axis=0)
-            open_s = min(
-                _LONGEST_S * self._gain(index) / self._usual_gain,
-                2.0 * SHUTTER * 0.9 / options.rate,
-            )
-            blurred_px = (
-                np.linalg.norm(turned, axis=1).max() * open_s * options.rate * self.camera.fx
-            )
+            forward = self._T_scene_camera[max(index - 1, 0) : index + 2, :3, 2]
+            turned = np.linalg.norm(np.diff(forward, axis=0), axis=1).max()
+            longest_s = 2.0 * SHUTTER * 0.9 / options.rate
+            open_s = min(_LONGEST_S * self._gain(index) / self._usual_gain, longest_s)
+            blurred_px = turned * open_s * options.rate * self.camera.fx
             samples = int(np.clip(blurred_px / 4.0, 3, 12))
             offsets = offsets + open_s * ((np.arange(samples)[:, None] + 0.5) / samples - 0.5)
         if options.readout_s:
             rows = (np.arange(options.height) + 0.5) / options.height - 0.5
             offsets = offsets + options.readout_s * rows
-        moments = self._moments(index / options.rate + offsets.ravel(), options)
+        moments = self._moments(index / options.rate + offsets.ravel())
         poses = self._carried.poses(np.maximum(moments, 0.0)).reshape(*offsets.shape, 4, 4)
         return poses[:, 0] if offsets.shape[1] == 1 else poses
 
@@ -114,40 +107,28 @@ class SimulatedRooms(SimulatedWorld):
         if self._people is None:
             return []
         now = index / self.options.rate
-        T_scene_people = [
-            _standing(self._carried, now + _AHEAD_S),
-            *(_standing(walk, now) for walk in self._walks),
-        ]
+        # the first walks where the camera will be
+        walkers = [(self._carried, now + _AHEAD_S), *((walk, now) for walk in self._walks)]
         camera = self._T_scene_camera[index, :2, 3]
-        far = [np.linalg.norm(T[:2, 3] - camera) > _NEAREST_M for T in T_scene_people]
-        return self._people.placed(
-            {number: T for number, T in enumerate(T_scene_people) if far[number]}
-        )
+        seen = {}
+        for number, (walk, seconds) in enumerate(walkers):
+            T_scene_person = _standing(walk, seconds)
+            if np.linalg.norm(T_scene_person[:2, 3] - camera) > _NEAREST_M:
+                seen[number] = T_scene_person
+        return self._people.placed(seen)
 
-    def _background(self, directions: Float32Array) -> Float32Array:
-        return np.zeros_like(directions)
-
-    def _shade(
-        self,
-        surfaces: list[Surface],
-        number: int,
-        hits: Hits,
-        rays: Float32Array,
-        pixels: NDArray[np.int64],
-    ) -> Float32Array:
-        rgb = surfaces[number].unlit(hits, self.camera.fx)
-        if number > 0:  # people are as bright as what is below them
-            down = rays.copy()
-            down[:, :3] += rays[:, 3:] * hits.depth[:, None]
-            down[:, 3:] = (0.0, 0.0, -1.0)
-            hits_below = self._still.cast(down)
-            below = np.minimum(
-                hits_below["primitive_ids"].astype(np.int64), self._irradiance.shape[1] - 1
-            )
-            return np.asarray(
-                rgb * self._irradiance[:, below].mean(axis=0) * (0.85 + 0.15 * hits.normals[2])
-            )
-        return np.asarray(rgb * self._light(hits.triangle, hits.barycentric))
+    def _shade(self, hits: Hits, surfaces: list[Surface]) -> Float32Array:
+        rgb = hits.unlit(self.camera.fx)
+        if hits.surface is self._still:
+            return np.asarray(rgb * self._light(hits.triangle, hits.barycentric))
+        # people are as bright as what is below them
+        down = hits.rays.copy()
+        down[:, :3] += down[:, 3:] * hits.depth[:, None]
+        down[:, 3:] = (0.0, 0.0, -1.0)
+        below = self._still.cast(down)["primitive_ids"].astype(np.int64)
+        below = np.minimum(below, self._irradiance.shape[1] - 1)
+        light = self._irradiance[:, below].mean(axis=0)
+        return np.asarray(rgb * light * (0.85 + 0.15 * hits.normals[2]))
 
     def _light(self, triangle: NDArray[np.int64], barycentric: Float32Array) -> Float32Array:
         """Irradiance at points of triangles ``(N,)``; of what glows, its own light."""
@@ -165,7 +146,7 @@ class SimulatedRooms(SimulatedWorld):
         gain = self._gain(index)
         rgb = through_lens(rgb * np.float32(gain))
         if "exposure" in self.options.hazards:
-            rng = np.random.default_rng([self.options.seed, 56, index])
+            rng = luck(self.options.seed, 56, index)
             rgb = rgb + rng.standard_normal(rgb.shape, dtype=np.float32) * np.float32(
                 0.008 * np.sqrt(gain)
             )
@@ -177,12 +158,7 @@ class SimulatedRooms(SimulatedWorld):
             return self._usual_gain
         last = int(index / self.options.rate / _METER_S)
         read = np.array([self._brightness(max(last - k, 0)) for k in range(_METERED)])
-        return float(
-            _GREY
-            / max(
-                (read * np.exp(-_METER_S * np.arange(_METERED) / 0.35)).sum() / _METER_WEIGHT, 0.06
-            )
-        )
+        return float(_GREY / max((read * _METER_WEIGHTS).sum() / _METER_WEIGHTS.sum(), 0.06))
 
     @functools.cached_property
     def _usual_gain(self) -> float:
@@ -193,7 +169,7 @@ class SimulatedRooms(SimulatedWorld):
     @functools.lru_cache(maxsize=256)  # noqa: B019 - readings are small, worlds are kept for long
     def _brightness(self, tick: int) -> float:
         """Mean of a coarse image without textures, as the camera's meter sees it."""
-        moment = self._moments(np.array([tick * _METER_S]), self.options)
+        moment = self._moments(np.array([tick * _METER_S]))
         few = self._rays[:: max(len(self._rays) // 400, 1)]
         answer = self._still.cast(place_rays(self._carried.poses(moment)[0], few))
         met = np.isfinite(answer["t_hit"])

@@ -12,7 +12,15 @@ from scipy.ndimage import gaussian_filter1d
 
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
-from slam.simulation.geometry import Bend, FloatArray, road_bend, town_bend
+from slam.simulation.geometry import (
+    Bend,
+    FloatArray,
+    interpolated,
+    luck,
+    road_bend,
+    town_bend,
+    unit,
+)
 from slam.simulation.options import StreetKind, Variety
 
 Node = tuple[int, int]
@@ -143,7 +151,7 @@ def town_plan(
     """
     span = np.max(drive, axis=0)
     lines = [_lines(rng, int(count), spacing) for count in span]
-    half_width = float(rng.uniform(4.6, 5.2))
+    half_width = rng.uniform(4.6, 5.2)
     shifted = [(i + 1, j + 1) for i, j in drive]
     along_x = rng.random((len(lines[0]) - 1, len(lines[1]))) < side_streets
     along_y = rng.random((len(lines[0]), len(lines[1]) - 1)) < side_streets
@@ -167,7 +175,7 @@ def road_plan(rng: np.random.Generator, length: float, kind: StreetKind = "town"
     along_y = rng.random((len(xs), 2)) < side_streets
     along_y[[0, -1], :] = False
     drive = tuple((i, 1) for i in range(len(xs)))
-    return StreetPlan(xs, ys, along_x, along_y, float(rng.uniform(*widths)), drive, kind)
+    return StreetPlan(xs, ys, along_x, along_y, rng.uniform(*widths), drive, kind)
 
 
 def _lines(rng: np.random.Generator, count: int, spacing: float) -> FloatArray:
@@ -245,35 +253,36 @@ def plan_route(
     arrival = _arrival(bend, lane_plan, stops, moving)
     if route == "loop":
         arrival *= (moving - 1.0) / arrival[-1]
-    rng = np.random.default_rng([seed, 2])
-    camera_height_m = float(rng.uniform(1.5, 1.8)) if variety is None else variety.height_m
+    rng = luck(seed, 2)
+    camera_height_m = rng.uniform(1.5, 1.8) if variety is None else variety.height_m
     sample = np.interp(np.arange(moving), arrival, np.arange(len(arrival)))
     T_street_camera = _poses(rng, bend, lane_plan, sample, camera_height_m, variety)
     if stops:
         rest = int(np.argmin(np.diff(sample)))
         order = np.insert(np.arange(moving), rest, [rest] * still_frames)
         sample, T_street_camera = sample[order], T_street_camera[order]
-    lane_street = bend(np.pad(lane_plan, ((0, 0), (0, 1))))
-    return Route(
-        plan, bend, T_street_camera, camera_height_m, lane_street, _lane_offset(plan, seed), sample
-    )
+    lane_street, offset = bend(_level(lane_plan)), _lane_offset(plan, seed)
+    return Route(plan, bend, T_street_camera, camera_height_m, lane_street, offset, sample)
+
+
+def _level(points_plan: FloatArray) -> FloatArray:
+    """Points ``(N, 2)`` on the road, ``(N, 3)``."""
+    return np.pad(points_plan, ((0, 0), (0, 1)))
 
 
 def _layout(
     route: str, moving: int, seed: int, stops: bool, variety: Variety | None
 ) -> tuple[StreetPlan, Bend, FloatArray]:
     """Streets, their bend, and the lane to drive ``(M, 2)``, long enough for ``moving`` frames."""
-    rng = np.random.default_rng([seed, 0])
+    rng = luck(seed, 0)
     kind: StreetKind = "town" if variety is None else variety.kind
     hills = None if variety is None else (variety.steepness, variety.wavelength_m)
     if route == "straight":
         end = START + 1.25 * moving + 5.0
         plan = road_plan(rng, end, kind)
-        bend = road_bend(
-            np.random.default_rng([seed, 1]), plan.xs[0] - 200.0, plan.xs[-1] + 200.0, hills
-        )
+        bend = road_bend(luck(seed, 1), plan.xs[0] - 200.0, plan.xs[-1] + 200.0, hills)
         return plan, bend, _lane(plan, seed)[int(START / STEP) : int(end / STEP)]
-    bend = town_bend(np.random.default_rng([seed, 1]), hills)
+    bend = town_bend(luck(seed, 1), hills)
     if route == "grid":
         side = 3 if moving < 500 else 4 if moving < 1200 else 5
         spacing = (
@@ -287,12 +296,12 @@ def _layout(
     edges = max(8, 2 * round((0.95 * moving - OVERLAP) / 84.0))
     spacing = 36.0
     for _ in range(8):
-        rng = np.random.default_rng([seed, 0])
+        rng = luck(seed, 0)
         cycle = loop_cycle(rng, edges)
         plan = town_plan(rng, cycle + cycle + cycle[:1], spacing, side_streets=0.35, kind=kind)
         # around a cycle that is driven twice, cut off ``OVERLAP`` metres after its start is met
         first, second = plan.node(plan.drive[0]), plan.node(plan.drive[1])
-        lane_plan = _lane(plan, seed)[int(0.5 * float(np.linalg.norm(second - first)) / STEP) :]
+        lane_plan = _lane(plan, seed)[int(0.5 * np.linalg.norm(second - first) / STEP) :]
         away = np.linalg.norm(lane_plan - lane_plan[0], axis=1)
         met = int(60.0 / STEP)
         met += int(np.argmax(away[met:] < 2.0))
@@ -307,31 +316,30 @@ def _layout(
 
 def _lane_offset(plan: StreetPlan, seed: int) -> float:
     """How far right of the middle of the street the car drives, metres."""
-    return float(np.random.default_rng([seed, 4]).uniform(0.33, 0.38)) * plan.half_width
+    return luck(seed, 4).uniform(0.33, 0.38) * plan.half_width
 
 
 def _lane(plan: StreetPlan, seed: int) -> FloatArray:
     """The whole driven path ``(M, 2)``: right-hand lane, rounded corners and a little drift."""
-    rng = np.random.default_rng([seed, 3])
+    rng = luck(seed, 3)
     nodes = np.stack([plan.node(node) for node in plan.drive])  # (n, 2)
     offset = _lane_offset(plan, seed)
     ahead = np.diff(nodes, axis=0)
-    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    ahead = unit(ahead)
     right = np.stack([ahead[:, 1], -ahead[:, 0]], axis=1)
     turns = ahead[:-1, 0] * ahead[1:, 1] - ahead[:-1, 1] * ahead[1:, 0]
-    corners = [nodes[0] + offset * right[0]]
-    for node, before, after, turn in zip(nodes[1:-1], right[:-1], right[1:], turns):
-        corners.append(node + offset * (before + after if abs(turn) > 0.5 else after))
-    corners.append(nodes[-1] + offset * right[-1])
+    sideways = np.concatenate([right, right[-1:]])
+    sideways[1:-1] += right[:-1] * (np.abs(turns) > 0.5)[:, None]
+    corners = nodes + offset * sideways
     rounded: list[FloatArray] = []
     for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:]):
         rounded += _corner(rng, before, corner, after)
     path = _resample(np.stack([corners[0], *rounded, corners[-1]]))
     path = gaussian_filter1d(path, 1.6 / STEP, axis=0, mode="nearest")
     tangent = np.gradient(path, axis=0)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    tangent = unit(tangent)
     drift = gaussian_filter1d(rng.standard_normal(len(path)), 14.0 / STEP)
-    drift *= 0.13 / max(float(drift.std()), 1e-9)
+    drift *= 0.13 / max(drift.std(), 1e-9)
     path += np.clip(drift, -0.28, 0.28)[:, None] * np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
     return _resample(path)
 
@@ -341,12 +349,12 @@ def _corner(
 ) -> list[FloatArray]:
     """An arc of 8.5 to 11 m radius, less where edges are short; the corner alone if straight on."""
     a, b = before - corner, after - corner
-    shorter = min(float(np.linalg.norm(a)), float(np.linalg.norm(b)))
-    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    lengths = np.linalg.norm([a, b], axis=1)
+    a, b = np.stack([a, b]) / lengths[:, None]
     wish = rng.uniform(8.5, 11.0)
     if a @ b < -0.5:
         return [corner]
-    radius = min(wish, 0.49 * shorter)
+    radius = min(wish, 0.49 * lengths.min())
     centre = corner + radius * (a + b)
     return [
         centre - radius * (np.cos(t) * b + np.sin(t) * a) for t in np.linspace(0.0, np.pi / 2.0, 12)
@@ -357,28 +365,28 @@ def _resample(path: FloatArray) -> FloatArray:
     """Points every ``STEP`` metres along a polyline."""
     length = se3.distance_along(path)
     along = np.arange(0.0, length[-1], STEP)
-    return np.stack([np.interp(along, length, path[:, i]) for i in range(path.shape[1])], axis=1)
+    return interpolated(along, length, path)
 
 
 def _arrival(bend: Bend, lane_plan: FloatArray, stops: bool, moving: int) -> FloatArray:
     """Frame number at each point of a lane: slow in corners, acceleration bounded as a car's."""
-    points = bend(np.pad(lane_plan, ((0, 0), (0, 1))))
+    points = bend(_level(lane_plan))
     step = np.linalg.norm(np.diff(points, axis=0), axis=1)
     tangent = np.gradient(points[:, :2], axis=0)
     heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
-    curvature = np.abs(gaussian_filter1d(np.gradient(heading), 4.0)) / float(step.mean())
+    curvature = np.abs(gaussian_filter1d(np.gradient(heading), 4.0)) / step.mean()
     along = np.cumsum(step)
     cruise = CRUISE * (1.0 + 0.12 * np.sin(along / 23.0) * np.sin(along / 61.0 + 1.0))
     speed = np.clip(
         np.sqrt(LATERAL_ACCELERATION / np.maximum(curvature[1:], 1e-4)), SLOWEST, cruise
     )
     if stops:
-        rest = 0.5 * min(float(along[-1]), 0.9 * moving)
+        rest = 0.5 * min(along[-1], 0.9 * moving)
         speed = np.minimum(speed, 0.08 + np.sqrt(2.5 * ACCELERATION * np.abs(along - rest)))
-    for k in range(1, len(speed)):
-        speed[k] = min(speed[k], np.sqrt(speed[k - 1] ** 2 + 2.0 * ACCELERATION * step[k]))
-    for k in range(len(speed) - 2, -1, -1):
-        speed[k] = min(speed[k], np.sqrt(speed[k + 1] ** 2 + 2.0 * ACCELERATION * step[k]))
+    for speeds, steps in ((speed, step), (speed[::-1], step[::-1])):  # speeding up, and braking
+        for k in range(1, len(speeds)):
+            fastest = np.sqrt(speeds[k - 1] ** 2 + 2.0 * ACCELERATION * steps[k])
+            speeds[k] = min(speeds[k], fastest)
     return np.concatenate([[0.0], np.cumsum(step / speed)])
 
 
@@ -396,17 +404,15 @@ def _poses(
     """
     rows = np.arange(len(lane_plan))
     direction = gaussian_filter1d(np.gradient(lane_plan, axis=0), 4.0, axis=0)
-    plan_xy = np.stack([np.interp(sample, rows, lane_plan[:, i]) for i in range(2)], axis=1)
-    tangent = np.stack([np.interp(sample, rows, direction[:, i]) for i in range(2)], axis=1)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    at = np.pad(plan_xy, ((0, 0), (0, 1)))
-    ahead = np.pad(tangent, ((0, 0), (0, 1)))
+    tangent = interpolated(sample, rows, direction)
+    tangent = unit(tangent)
+    at, ahead = _level(interpolated(sample, rows, lane_plan)), _level(tangent)
     across = np.stack([tangent[:, 1], -tangent[:, 0], np.zeros(len(at))], axis=1)
     forward = bend(at + ahead) - bend(at - ahead)
     right = bend(at + across) - bend(at - across)
-    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    forward = unit(forward)
     right -= (right * forward).sum(axis=1, keepdims=True) * forward
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    right = unit(right)
     down = np.cross(forward, right)
     # suspension: pitch, yaw and roll about x, y, z in radians and height in metres, correlated in
     # time, (N, 4)

@@ -1,109 +1,286 @@
-"""Simple bodies that objects are made of, their colours, frames and level rectangles of a plan."""
+"""Where surfaces are built: simple bodies and their looks, and level rectangles of a plan."""
+
+import copy
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from slam.simulation.geometry import FloatArray, Soup
+from erfsfm.common.config_tree import parse_yaml
+from erfsfm.common.files import read_text
+from slam.simulation.geometry import (
+    FLAT,
+    MATERIALS,
+    PARAMETERS,
+    Bend,
+    Float32Array,
+    FloatArray,
+    IntArray,
+    Material,
+    Mesh,
+    unit,
+)
 
-UP = np.array([0.0, 0.0, 1.0])
 Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1
 
+UP = np.array([0.0, 0.0, 1.0])
+# fields of a mesh whose last axis is that of its triangles
+_OF_TRIANGLES = ("uv", "normals", "tangents", "instance", "material")
 
-def colour(
-    rng: np.random.Generator, *choices: tuple[float, float, float], spread: float = 0.06
-) -> FloatArray:
-    """One of the given colours, a little off, ``(3,)``."""
-    base = np.array(choices[rng.integers(len(choices))])
-    return np.asarray(
-        np.clip(base + rng.normal(0.0, spread) + rng.normal(0.0, 0.4 * spread, 3), 0.02, 1.0)
+
+@functools.cache
+def _palettes() -> Any:
+    """Spread and colours of each thing."""
+    return parse_yaml(read_text(Path(__file__).with_name("colours.yaml")))
+
+
+@functools.lru_cache(maxsize=256)
+def _patch_triangles(rows: int, columns: int) -> IntArray:
+    """Triangles of a grid of vertices, wound so that (column, row) is right-handed, ``(T, 3)``."""
+    index = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = (
+        part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1])
     )
+    return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
 
 
-def frame_at(x: float, y: float, angle: float, z: float = 0.0) -> FloatArray:
-    """Frame at a place in the plan, its x axis turned by ``angle`` radians from east.
+class Site:
+    """A place to build at. All places of a world collect patches for one mesh.
 
-    Returns:
-        The x, y and z axis and the origin as rows, ``(4, 3)``.
+    Attributes:
+        rng: draws what is left open.
+        frame: the place's x, y and z axis and its origin as rows, ``(4, 3)``.
+        looks: material, colours and parameters of each instance so far.
     """
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0], [x, y, z]])
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        """A world without surfaces, at the origin of its plan."""
+        self.rng, self.frame = rng, np.eye(4, 3)
+        # vertices, triangles, their texture coordinates and instances, patch by patch
+        self._patches: list[tuple[FloatArray, IntArray, FloatArray, IntArray]] = []
+        self.looks: list[tuple[int, FloatArray, FloatArray]] = []
+
+    @property
+    def origin(self) -> FloatArray:
+        """Where it is, ``(3,)``."""
+        return np.asarray(self.frame[3])
+
+    def at(self, x: float, y: float, angle: float = 0.0, z: float = 0.0) -> "Site":
+        """Another place in the plan, its x axis turned by ``angle`` radians from east."""
+        c, s = np.cos(angle), np.sin(angle)
+        site = copy.copy(self)
+        site.frame = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0], [x, y, z]])
+        return site
+
+    def moved(self, along: float, across: float = 0.0, up: float = 0.0) -> "Site":
+        """The place so far along its own axes, metres."""
+        site = copy.copy(self)
+        site.frame = self.frame.copy()
+        site.frame[3] += along * self.frame[0] + across * self.frame[1] + up * self.frame[2]
+        return site
+
+    def drawn_by(self, rng: np.random.Generator) -> "Site":
+        """The place with other luck."""
+        site = copy.copy(self)
+        site.rng = rng
+        return site
+
+    def colour(self, thing: str) -> FloatArray:
+        """One of the colours that a thing of ``colours.yaml`` may have, a little off, ``(3,)``."""
+        spread, colours = itemgetter("spread", "colours")(_palettes()[thing])
+        base = np.array(colours[self.rng.integers(len(colours))])
+        off = self.rng.normal(0.0, spread) + self.rng.normal(0.0, 0.4 * spread, 3)
+        return np.asarray(np.clip(base + off, 0.02, 1.0))
+
+    def instance(
+        self,
+        material: Material,
+        colour: ArrayLike,
+        second: ArrayLike = 1.0,
+        parameters: tuple[float, ...] = (),
+    ) -> int:
+        """Register an instance with its colours and parameters; return its number.
+
+        Args:
+            material: selects its texture.
+            colour: RGB in [0, 1], ``(3,)``, or the name of a thing whose `colour` is drawn.
+            second: the same of the texture's second colour, or a share of the first.
+            parameters: of the texture.
+        """
+        row = np.zeros(PARAMETERS)
+        row[: len(parameters)] = parameters
+        colour = self.colour(colour) if isinstance(colour, str) else np.array(colour)
+        if isinstance(second, str):
+            second = self.colour(second)
+        elif isinstance(second, float):
+            second = second * colour
+        self.looks.append((MATERIALS.index(material), np.array([colour, second]), row))
+        return len(self.looks) - 1
+
+    def patch(self, points: FloatArray, uv: FloatArray, instance: int) -> None:
+        """Add a grid of quads.
+
+        Args:
+            points: its vertices in the plan, ``(R, C, 3)``.
+            uv: texture coordinates of the vertices, metres, ``(R, C, 2)``.
+            instance: its look, a number from `instance`.
+        """
+        triangles = _patch_triangles(points.shape[0], points.shape[1])
+        looks = np.full(len(triangles), instance)
+        self._patches.append(
+            (points.reshape(-1, 3), triangles, uv.reshape(-1, 2)[triangles], looks)
+        )
+
+    def quad(self, corner: FloatArray, along: FloatArray, up: FloatArray, instance: int) -> None:
+        """Add one parallelogram, textured in metres from its corner."""
+        points = np.stack([[corner, corner + along], [corner + up, corner + along + up]])
+        width, height = np.linalg.norm(along), np.linalg.norm(up)
+        self.patch(
+            points, np.array([[[0, 0], [width, 0]], [[0, height], [width, height]]]), instance
+        )
+
+    def box(self, low: ArrayLike, high: ArrayLike, instance: int, top: int = -1) -> None:
+        """Four walls and a lid between two corners at the place; ``top`` may look different."""
+        axis_x, axis_y, axis_z, origin = self.frame
+        low, high = np.array(low), np.array(high)
+        wx, wy, wz = high - low
+        corner = origin + low @ self.frame[:3]
+        self.quad(corner, wx * axis_x, wz * axis_z, instance)
+        self.quad(corner + wx * axis_x, wy * axis_y, wz * axis_z, instance)
+        self.quad(corner + wx * axis_x + wy * axis_y, -wx * axis_x, wz * axis_z, instance)
+        self.quad(corner + wy * axis_y, -wy * axis_y, wz * axis_z, instance)
+        self.quad(corner + wz * axis_z, wx * axis_x, wy * axis_y, instance if top < 0 else top)
+
+    def solid(
+        self, low: tuple[float, ...], size: tuple[float, ...], look: int, top: int = -1
+    ) -> None:
+        """A box by its lowest corner and its size, closed below."""
+        self.box(low, np.add(low, size), look, top)
+        if low[2] > 0.0:
+            foot = self.origin + low @ self.frame[:3] + size[1] * self.frame[1]
+            self.quad(foot, size[0] * self.frame[0], -size[1] * self.frame[1], look)
+
+    def plate(self, low: tuple[float, ...], size: tuple[float, ...], front: int, rest: int) -> None:
+        """A box that shows ``front`` on the side that leaves the wall, a hair before the box."""
+        self.solid(low, size, rest)
+        right = low[0] + size[0], low[1] + size[1] + 0.002, low[2]
+        corner = self.origin + right @ self.frame[:3]
+        self.quad(corner, -size[0] * self.frame[0], size[2] * self.frame[2], front)
+
+    def tube(
+        self, base: FloatArray, tip: FloatArray, radii: tuple[float, float], instance: int
+    ) -> None:
+        """Six-sided tapering tube from ``base`` to ``tip``, ``(3,)`` each."""
+        height = float(np.linalg.norm(tip - base))
+        axis = (tip - base) / height
+        side = np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.7 else [0.0, 1.0, 0.0])
+        side /= np.linalg.norm(side)
+        other = np.cross(axis, side)
+        angle = np.linspace(0.0, 2.0 * np.pi, 7)
+        ring = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * other  # (7, 3)
+        points = np.stack([base + radii[0] * ring, tip + radii[1] * ring])
+        self.patch(points, lattice(angle * radii[0], (0.0, height)), instance)
+
+    def pole(self, height: float, radii: tuple[float, float], instance: int) -> FloatArray:
+        """A `tube` that stands at the place; its tip ``(3,)``."""
+        tip = self.origin + height * UP
+        self.tube(self.origin, tip, radii, instance)
+        return tip
+
+    def ball(self, centre: FloatArray, radii: ArrayLike, instance: int) -> None:
+        """A lumpy ellipsoid of 6 x 9 faces around a point ``(3,)``."""
+        size = np.asarray(radii)
+        around, polar = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 10), np.linspace(0.0, np.pi, 7))
+        sin_polar = np.sin(polar)
+        unit = np.stack(
+            [sin_polar * np.cos(around), sin_polar * np.sin(around), np.cos(polar)], axis=2
+        )
+        lump = self.rng.uniform(0.75, 1.2, (7, 10, 1))
+        lump[:, -1], lump[0], lump[-1] = lump[:, 0], 1.0, 1.0
+        uv = np.stack([around * size[0], polar * size[2]], axis=2)
+        self.patch(centre + unit * lump * size, uv, instance)
+
+    def finish(self, bend: Bend) -> Mesh:
+        """Bend every vertex from plan to street coordinates and drop triangles without area."""
+        points, triangles_of, uv_of, instances = zip(*self._patches)
+        first = np.cumsum([0, *map(len, points)])
+        vertices = bend(np.concatenate(points))
+        triangles = np.concatenate([mine + k for mine, k in zip(triangles_of, first)])
+        uv, instance = np.concatenate(uv_of), np.concatenate(instances)
+        materials, colours, parameters = map(np.array, zip(*self.looks))
+        corners = vertices[triangles]  # (T, 3, 3)
+        edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        normals = np.cross(edge1, edge2)
+        area = np.linalg.norm(normals, axis=1)
+        keep = area > 1e-6
+        uv1, uv2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+        determinant = uv1[:, 0] * uv2[:, 1] - uv2[:, 0] * uv1[:, 1]
+        tangents = (edge1 * uv2[:, 1:] - edge2 * uv1[:, 1:]) * np.sign(determinant)[:, None]
+        tangents = unit(tangents)
+        normals /= np.maximum(area, 1e-9)[:, None]
+        return Mesh(
+            vertices=vertices.astype(np.float32),
+            triangles=triangles[keep].astype(np.uint32),
+            uv=_last(uv[keep]),
+            normals=_last(normals[keep]),
+            tangents=_last(tangents[keep]),
+            instance=instance[keep].astype(np.int32),
+            material=materials.astype(np.int8)[instance[keep]],
+            colours=_last(colours),
+            parameters=_last(parameters),
+            offsets=_last(self.rng.uniform(0.0, 200.0, (len(self.looks), 2))),
+        )
 
 
-def box(
-    soup: Soup, frame: FloatArray, low: FloatArray, high: FloatArray, instance: int, top: int = -1
-) -> None:
-    """Four walls and a lid between two corners given in ``frame``; ``top`` may look different."""
-    axis_x, axis_y, axis_z, origin = frame
-    wx, wy, wz = high - low
-    corner = origin + low @ frame[:3]
-    soup.quad(corner, wx * axis_x, wz * axis_z, instance)
-    soup.quad(corner + wx * axis_x, wy * axis_y, wz * axis_z, instance)
-    soup.quad(corner + wx * axis_x + wy * axis_y, -wx * axis_x, wz * axis_z, instance)
-    soup.quad(corner + wy * axis_y, -wy * axis_y, wz * axis_z, instance)
-    soup.quad(corner + wz * axis_z, wx * axis_x, wy * axis_y, instance if top < 0 else top)
+def _last(table: FloatArray) -> Float32Array:
+    """A table with its first axis moved to the end, contiguous."""
+    return np.ascontiguousarray(np.moveaxis(table, 0, -1), dtype=np.float32)
 
 
-def solid(
-    soup: Soup,
-    frame: FloatArray,
-    low: tuple[float, ...],
-    size: tuple[float, ...],
-    look: int,
-    top: int = -1,
-) -> None:
-    """A box by its lowest corner and its size, closed below."""
-    corner, extent = np.array(low), np.array(size)
-    box(soup, frame, corner, corner + extent, look, top)
-    if low[2] > 0.0:
-        foot = frame[3] + corner @ frame[:3] + extent[1] * frame[1]
-        soup.quad(foot, extent[0] * frame[0], -extent[1] * frame[1], look)
+class Moving:
+    """Meshes around their own origins, to be placed anew at every frame."""
+
+    def __init__(self, rng: np.random.Generator, makers: Sequence[Callable[[Site], None]]) -> None:
+        """Things that are made one after another at one site."""
+        site, after = Site(rng), []
+        for make in makers:
+            make(site)
+            after.append(len(site.looks))
+        self._mesh = site.finish(FLAT)
+        self._thing_of_triangle = np.searchsorted(after, self._mesh.instance, side="right")
+
+    def placed(self, T_scene_things: dict[int, FloatArray]) -> list[Mesh]:
+        """One mesh of the things of these numbers at their poses ``(4, 4)``; none of no things."""
+        if not T_scene_things:
+            return []
+        parts = [
+            self._part(number, T_scene_thing) for number, T_scene_thing in T_scene_things.items()
+        ]
+        corners = np.concatenate([part.vertices for part in parts])
+        corners_of = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
+        tables = {}
+        for name in _OF_TRIANGLES:
+            tables[name] = np.concatenate([getattr(part, name) for part in parts], axis=-1)
+        return [dataclasses.replace(self._mesh, vertices=corners, triangles=corners_of, **tables)]
+
+    def _part(self, number: int, T_scene_thing: FloatArray) -> Mesh:
+        """The triangles of one thing, three vertices each, moved into the scene."""
+        mine = self._thing_of_triangle == number
+        R, t = T_scene_thing[:3, :3].astype(np.float32), T_scene_thing[:3, 3].astype(np.float32)
+        tables = {name: getattr(self._mesh, name)[..., mine] for name in _OF_TRIANGLES}
+        tables |= {name: R @ tables[name] for name in ("normals", "tangents")}
+        vertices = self._mesh.vertices[self._mesh.triangles[mine].ravel()] @ R.T + t
+        return dataclasses.replace(self._mesh, vertices=vertices, **tables)
 
 
-def plate(
-    soup: Soup,
-    frame: FloatArray,
-    low: tuple[float, ...],
-    size: tuple[float, ...],
-    front: int,
-    rest: int,
-) -> None:
-    """A box that shows ``front`` on the side that leaves the wall, a hair before the box."""
-    solid(soup, frame, low, size, rest)
-    corner = frame[3] + np.array([low[0] + size[0], low[1] + size[1] + 0.002, low[2]]) @ frame[:3]
-    soup.quad(corner, -size[0] * frame[0], size[2] * frame[2], front)
-
-
-def tube(
-    soup: Soup, base: FloatArray, tip: FloatArray, radii: tuple[float, float], instance: int
-) -> None:
-    """Six-sided tapering tube from ``base`` to ``tip``, ``(3,)`` each."""
-    axis = (tip - base) / np.linalg.norm(tip - base)
-    side = np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.7 else [0.0, 1.0, 0.0])
-    side /= np.linalg.norm(side)
-    other = np.cross(axis, side)
-    angle = np.linspace(0.0, 2.0 * np.pi, 7)
-    ring = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * other  # (7, 3)
-    points = np.stack([base + radii[0] * ring, tip + radii[1] * ring])
-    height = float(np.linalg.norm(tip - base))
-    along = np.stack([angle * radii[0], angle * radii[0]])
-    soup.patch(points, np.stack([along, np.array([[0.0] * 7, [height] * 7])], axis=2), instance)
-
-
-def ball(
-    soup: Soup, rng: np.random.Generator, centre: FloatArray, radii: FloatArray, instance: int
-) -> None:
-    """A lumpy ellipsoid of 6 x 9 faces."""
-    polar, around = np.linspace(0.0, np.pi, 7), np.linspace(0.0, 2.0 * np.pi, 10)
-    sin_polar = np.sin(polar)[:, None]
-    up = np.cos(polar)[:, None] * np.ones(10)
-    unit = np.stack([sin_polar * np.cos(around), sin_polar * np.sin(around), up], axis=2)
-    lump = rng.uniform(0.75, 1.2, (7, 10, 1))
-    lump[:, -1], lump[0], lump[-1] = lump[:, 0], 1.0, 1.0
-    points = centre + unit * lump * radii
-    uv = np.stack(
-        [np.broadcast_to(around * radii[0], (7, 10)), np.tile(polar[:, None] * radii[2], 10)],
-        axis=2,
-    )
-    soup.patch(points, uv, instance)
+def lattice(u: ArrayLike, v: ArrayLike) -> FloatArray:
+    """Coordinates of a grid ``(R, C, 2)`` by those of its columns ``(C,)`` and of its rows ``(R,)``."""
+    return np.stack(np.meshgrid(u, v), axis=2)
 
 
 def grid_over(rectangle: Rectangle, z: float, step: float) -> FloatArray:
@@ -111,20 +288,13 @@ def grid_over(rectangle: Rectangle, z: float, step: float) -> FloatArray:
     x0, y0, x1, y1 = rectangle
     x = np.linspace(x0, x1, max(1, int((x1 - x0) / step)) + 1)
     y = np.linspace(y0, y1, max(1, int((y1 - y0) / step)) + 1)
-    gx, gy = np.meshgrid(x, y)
-    return np.stack([gx, gy, np.full_like(gx, z)], axis=2)
+    return np.pad(lattice(x, y), ((0, 0), (0, 0), (0, 1)), constant_values=z)
 
 
 def corners_of(rectangle: Rectangle) -> FloatArray:
     """South west, south east, north east and north west, ``(4, 2)``."""
     x0, y0, x1, y1 = rectangle
     return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
-
-
-def frame_along(rectangle: Rectangle, number: int, z: float) -> FloatArray:
-    """Frame along a side, counterclockwise from the south."""
-    x, y = corners_of(rectangle)[number]
-    return frame_at(x, y, number * np.pi / 2.0, z)
 
 
 def directed(start: FloatArray, end: FloatArray) -> tuple[float, FloatArray, FloatArray, float]:

@@ -8,18 +8,17 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.runtime.imports import import_open3d
-from slam.simulation.geometry import Float32Array, FloatArray, Mesh, Moving
+from slam.simulation.geometry import Float32Array, FloatArray, Mesh, luck
 from slam.simulation.objects import bonnet, car
 from slam.simulation.options import SimulationOptions, draw_variety
 from slam.simulation.route import STEP, Route, plan_route
-from slam.simulation.shapes import frame_at
-from slam.simulation.texture import Texels, fractal
+from slam.simulation.shapes import Moving
+from slam.simulation.texture import Axis, Texels
 from slam.simulation.town import build_town
 from slam.simulation.world import (
     SHUTTER,
@@ -53,7 +52,7 @@ class SimulatedStreet(SimulatedWorld):
     """A street world and a drive through it; the attributes are those of `SimulatedWorld`."""
 
     camera_height_m: float
-    T_camera_lidar: FloatArray
+    T_camera_lidar = T_CAMERA_LIDAR
 
     def __init__(self, options: SimulationOptions) -> None:
         """Plan the drive.
@@ -63,28 +62,25 @@ class SimulatedStreet(SimulatedWorld):
         """
         size = options.width, options.height
         still = STILL_FRAMES if "stop" in options.hazards else 0
-        variety = (
-            draw_variety(options.seed, options.route == "straight") if options.varied else None
-        )
-        camera = KITTI_CAMERA.resized(*size) if variety is None else variety.camera(*size)
+        camera, variety = KITTI_CAMERA.resized(*size), None
+        weather = draw_weather
+        if options.varied:
+            variety = draw_variety(options.seed, options.route == "straight")
+            camera, weather = variety.camera(*size), draw_varied_weather
         if options.fov_deg is not None:
             camera = square_camera(*size, options.fov_deg)
         self._route = plan_route(options.route, options.frames, options.seed, still, variety)
         super().__init__(options, camera, self._route.T_street_camera)
         self.camera_height_m = self._route.camera_height_m
-        self.T_camera_lidar = T_CAMERA_LIDAR.copy()
         self._variety = variety
-        self._weather = (
-            draw_varied_weather(options.seed) if options.varied else draw_weather(options.seed)
-        )
-        rng = np.random.default_rng([options.seed, 31])
+        self._weather = weather(options.seed)
+        rng = luck(options.seed, 31)
         # gain and gamma of every frame, piecewise constant
-        self._exposure = np.empty((options.frames, 2))
-        start = 0
-        while start < options.frames:
-            stop = start + int(rng.integers(12, 45))
-            self._exposure[start:stop] = rng.uniform(0.55, 1.5), rng.uniform(0.75, 1.3)
-            start = stop
+        exposures: list[list[float]] = []
+        while len(exposures) < options.frames:
+            lasts = rng.integers(12, 45)
+            exposures += [rng.uniform((0.55, 0.75), (1.5, 1.3)).tolist()] * lasts
+        self._exposure = exposures
         self._traffic = (
             Traffic(self._route, options.seed, options.varied)
             if "moving-cars" in options.hazards
@@ -94,7 +90,7 @@ class SimulatedStreet(SimulatedWorld):
     def scan(self, index: int) -> Float32Array:
         """LiDAR points of a frame ``(M, 4)``: x, y, z in the LiDAR, metres, and reflectance."""
         self._require(index)
-        rng = np.random.default_rng([self.options.seed, 40, index])
+        rng = luck(self.options.seed, 40, index)
         # each spin starts at a random angle: with the same rays in every scan the rings on the
         # ground would repeat exactly, and scan matching would estimate zero motion
         azimuth = (np.arange(COLUMNS) + rng.uniform()) * (2.0 * np.pi / COLUMNS)
@@ -102,8 +98,7 @@ class SimulatedStreet(SimulatedWorld):
         elevation = elevation + rng.normal(0.0, ELEVATION_NOISE, (BEAMS, COLUMNS))
         x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
         directions = np.stack([x, y, np.sin(elevation)], axis=-1).reshape(-1, 3).astype(np.float32)
-        T_street_lidar = self._route.T_street_camera[index] @ self.T_camera_lidar
-        rays = place_rays(T_street_lidar, directions)
+        rays = place_rays(self._T_scene_camera[index] @ T_CAMERA_LIDAR, directions)
         ranges = np.full(len(rays), np.inf, dtype=np.float32)
         reflectance = np.zeros(len(rays), dtype=np.float32)
         for surface in self._surfaces(index):
@@ -125,20 +120,19 @@ class SimulatedStreet(SimulatedWorld):
 
     def _moving(self, index: int) -> list[Mesh]:
         cars = self._traffic.placed(index) if self._traffic else []
-        return cars + (
-            self._bonnet.placed({0: self._route.T_street_camera[index]}) if self._bonnet else []
-        )
+        bonnet = self._bonnet.placed({0: self._T_scene_camera[index]}) if self._bonnet else []
+        return cars + bonnet
 
     @functools.cached_property
     def _bonnet(self) -> Moving | None:
         """The bonnet of the own car; none under motion blur, which would smear it."""
         if self._variety is None or self._variety.bonnet == 0.0 or "blur" in self.options.hazards:
             return None
-        rng = np.random.default_rng([self.options.seed, 12])
+        rng = luck(self.options.seed, 12)
         below = (
             self.options.height * (1.0 - self._variety.bonnet) - self.camera.cy
         ) / self.camera.fy
-        return Moving(rng, [lambda soup: bonnet(soup, rng, below, self.camera_height_m)])
+        return Moving(rng, [lambda site: bonnet(site, below, self.camera_height_m)])
 
     @functools.cached_property
     def _gain(self) -> float:
@@ -146,28 +140,25 @@ class SimulatedStreet(SimulatedWorld):
         if self._weather.exposure is not None:
             return self._weather.exposure
         frames = (0, len(self) // 2, len(self) - 1)
-        views = [
-            self._view(self._surfaces(index), self._route.T_street_camera[index])[0]
-            for index in frames
-        ]
+        views = [self._view(self._surfaces(index), self._T_scene_camera[index]) for index in frames]
         brightest = float(np.quantile(np.max(views, axis=-1), 1.0 - self._weather.saturated))
         return max(1.0 / brightest, _DARKEST_MEAN / float(np.mean(np.minimum(views, brightest))))
 
     def _exposures(self, index: int) -> FloatArray:
-        T_street_camera = self._route.T_street_camera
-        if "blur" in self.options.hazards:
-            # poses while the shutter is open around a frame; all one pose at a stop
-            low, high = max(index - 1, 0), min(index + 1, len(T_street_camera) - 1)
-            here = T_street_camera[index]
-            T_low_high = se3.invert(T_street_camera[low]) @ T_street_camera[high]
-            turn = Rotation.from_matrix(T_low_high[:3, :3]).as_rotvec()
-            if np.array_equal(here, T_street_camera[high]):
-                return np.repeat(here[None], BLUR_SAMPLES, axis=0)
-            fraction = (np.arange(BLUR_SAMPLES) + 0.5) / BLUR_SAMPLES - 0.5
-            fraction *= SHUTTER / (high - low)
-            motion = fraction[:, None] * turn, fraction[:, None] * T_low_high[:3, 3]
-            return np.asarray(here @ se3.from_rotation_vector(*motion))
-        return T_street_camera[index : index + 1]
+        T_street_camera = self._T_scene_camera
+        here = T_street_camera[index]
+        # poses while the shutter is open around a frame; all one pose at a stop
+        low, high = max(index - 1, 0), min(index + 1, len(self) - 1)
+        if "blur" not in self.options.hazards:
+            return np.asarray(here[None])
+        T_low_high = se3.invert(T_street_camera[low]) @ T_street_camera[high]
+        turn = Rotation.from_matrix(T_low_high[:3, :3]).as_rotvec()
+        fraction = ((np.arange(BLUR_SAMPLES) + 0.5) / BLUR_SAMPLES - 0.5)[:, None]
+        if np.array_equal(here, T_street_camera[high]):
+            fraction *= 0.0
+        fraction *= SHUTTER / (high - low)
+        motion = fraction * turn, fraction * T_low_high[:3, 3]
+        return np.asarray(here @ se3.from_rotation_vector(*motion))
 
     def _background(self, directions: Float32Array) -> Float32Array:
         weather, up = self._weather, np.clip(directions[2], 0.0, 1.0)
@@ -175,9 +166,11 @@ class SimulatedStreet(SimulatedWorld):
         plane = directions[:2] / (up + 0.12)
         still = np.zeros_like(up)
         size = 0.006 / (up + 0.12)
-        texels = Texels(plane[0], plane[1], size, size, still, still)
+        x, y = (Axis(at, size, still) for at in plane)
         cover = (
-            fractal(texels, (1.6, 1.6, 0.6), (0.6, 0.6, 0.35), (0.22, 0.22, 0.18))
+            Texels(x, y, rgb, rgb, rgb).fractal(
+                (1.6, 1.6, 0.6), (0.6, 0.6, 0.35), (0.22, 0.22, 0.18)
+            )
             + weather.clouds
             - 0.5
         )
@@ -185,17 +178,10 @@ class SimulatedStreet(SimulatedWorld):
         white = 0.88 + 0.08 * np.clip(cover, 0.0, 1.0)
         return np.asarray(rgb + fraction * (white - rgb), dtype=np.float32)
 
-    def _shade(
-        self,
-        surfaces: list[Surface],
-        number: int,
-        hits: Hits,
-        rays: Float32Array,
-        pixels: NDArray[np.int64],
-    ) -> Float32Array:
-        weather, mesh = self._weather, surfaces[number].mesh
+    def _shade(self, hits: Hits, surfaces: list[Surface]) -> Float32Array:
+        weather, mesh = self._weather, hits.surface.mesh
         towards = np.flatnonzero(weather.sun @ hits.normals > 0.0)
-        to_sun = np.take(rays, towards, axis=0)
+        to_sun = np.take(hits.rays, towards, axis=0)
         to_sun[:, :3] += (
             to_sun[:, 3:] * hits.depth[towards, None] + 0.03 * hits.normals[:, towards].T
         )
@@ -205,11 +191,11 @@ class SimulatedStreet(SimulatedWorld):
             [surface.scene.test_occlusions(tensor).numpy() for surface in surfaces], axis=0
         )
         lit = np.ones(self.options.height * self.options.width, dtype=np.float32)
-        lit[pixels[towards]] = 1.0 - shadow
+        lit[hits.pixels[towards]] = 1.0 - shadow
         # over neighbouring pixels
         soft = cv2.blur(lit.reshape(self.options.height, self.options.width), (3, 3))
-        lit = np.asarray(np.take(soft, pixels), dtype=np.float32)
-        rgb = surfaces[number].unlit(hits, self.camera.fx)
+        lit = np.asarray(np.take(soft, hits.pixels), dtype=np.float32)
+        rgb = hits.unlit(self.camera.fx)
         if weather.contrast != 1.0:
             base = np.take(mesh.colours[0], np.take(mesh.instance, hits.triangle), axis=1)
             rgb *= np.clip(1.15 * rgb / base, 0.2, 2.0) ** np.float32(weather.contrast - 1.0)
@@ -218,7 +204,8 @@ class SimulatedStreet(SimulatedWorld):
         warm = np.array([[1.05], [1.0], [0.92]], dtype=np.float32)
         cool = np.array([[0.96], [1.0], [1.06]], dtype=np.float32)
         rgb *= np.asarray(direct * warm + around * cool, dtype=np.float32)  # irradiance
-        haze = -np.expm1(-hits.distance / np.float32(weather.visibility_m))
+        distance = hits.depth * self._stretch[hits.pixels]
+        haze = -np.expm1(-distance / np.float32(weather.visibility_m))
         return np.asarray(rgb + haze * (weather.horizon[:, None] - rgb), dtype=np.float32)
 
     def _develop(self, rgb: Float32Array, index: int) -> Float32Array:
@@ -226,30 +213,26 @@ class SimulatedStreet(SimulatedWorld):
         rgb = rgb * np.float32(self._gain)
         if "rain" in self.options.hazards:
             rgb = rained_on(rgb, self.options.seed, index)
-        rgb = (
-            through_lens(rgb) if self._variety is None else through_lens(rgb, self._variety.blur_px)
-        )
+        rgb = through_lens(rgb, *([] if self._variety is None else [self._variety.blur_px]))
         if "exposure" in self.options.hazards:
-            gain, gamma = self._exposure[index].tolist()
+            gain, gamma = self._exposure[index]
             rgb = np.asarray(gain * np.power(np.clip(rgb, 0.0, 1.0), gamma), dtype=np.float32)
         if self._variety is not None:
             y, x = (np.linspace(-1.0, 1.0, side, dtype=np.float32) for side in rgb.shape[:2])
             falloff = 1.0 - np.float32(0.5 * self._variety.vignette) * (x * x + (y * y)[:, None])
-            grain = np.random.default_rng([self.options.seed, 35, index]).standard_normal(
-                rgb.shape, dtype=np.float32
-            )
+            grain = luck(self.options.seed, 35, index).standard_normal(rgb.shape, dtype=np.float32)
             rgb = np.asarray(rgb * falloff[..., None] + np.float32(self._variety.noise) * grain)
         return rgb
 
 
 def rained_on(rgb: Float32Array, seed: int, index: int) -> Float32Array:
     """Rain streaks and reduced contrast over an image ``(H, W, 3)`` about [0, 1]."""
-    rng = np.random.default_rng([seed, 32, index])
+    rng = luck(seed, 32, index)
     height, width = rgb.shape[:2]
     drops = (rng.random((height, width)) < 0.005).astype(np.float32) * rng.uniform(0.4, 1.0)
     length = max(3, height // 11)
     kernel = np.zeros((length, length), dtype=np.float32)
-    slant = float(rng.uniform(-0.3, 0.3))
+    slant = rng.uniform(-0.3, 0.3)
     for row in range(length):
         kernel[row, int(length / 2 + slant * (row - length / 2))] = 1.0
     streaks = np.clip(cv2.filter2D(drops, -1, kernel), 0.0, 1.0)[..., None] * 0.4
@@ -277,28 +260,31 @@ class Weather:
 def _draw_sun(rng: np.random.Generator, lowest: float, highest: float) -> FloatArray:
     """Its direction at an elevation in radians, ``(3,)``."""
     azimuth, elevation = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(lowest, highest)
-    sun = [
-        np.cos(elevation) * np.cos(azimuth),
-        np.cos(elevation) * np.sin(azimuth),
-        np.sin(elevation),
-    ]
+    level = np.cos(elevation)
+    sun = [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
     return np.array(sun)
+
+
+def _draw_tint(
+    rng: np.random.Generator, tint: tuple[float, ...], spread: float, bright: float = 1.0
+) -> Float32Array:
+    """A colour of the sky near another, ``(3,)``."""
+    return np.asarray(bright * (tint + rng.uniform(-spread, spread, 3)), dtype=np.float32)
 
 
 def draw_weather(seed: int) -> Weather:
     """Weather of a world."""
-    rng = np.random.default_rng([seed, 20])
-    sun = _draw_sun(rng, 0.5, 1.1)
-    sunshine = float(rng.uniform(0.25, 0.75))
+    rng = luck(seed, 20)
+    sun, sunshine = _draw_sun(rng, 0.5, 1.1), rng.uniform(0.25, 0.75)
     return Weather(
         sun=sun.astype(np.float32),
         sunshine=sunshine,
         ambient=0.95 - 0.6 * sunshine,
-        zenith=(np.array([0.38, 0.56, 0.85]) + rng.uniform(-0.06, 0.06, 3)).astype(np.float32),
-        horizon=(np.array([0.80, 0.84, 0.88]) + rng.uniform(-0.06, 0.06, 3)).astype(np.float32),
-        clouds=float(rng.uniform(0.0, 1.0)),
-        visibility_m=float(rng.uniform(220.0, 600.0)),
-        exposure=float(rng.uniform(0.95, 1.2)),
+        zenith=_draw_tint(rng, (0.38, 0.56, 0.85), 0.06),
+        horizon=_draw_tint(rng, (0.80, 0.84, 0.88), 0.06),
+        clouds=rng.uniform(0.0, 1.0),
+        visibility_m=rng.uniform(220.0, 600.0),
+        exposure=rng.uniform(0.95, 1.2),
     )
 
 
@@ -307,29 +293,26 @@ def draw_varied_weather(seed: int) -> Weather:
 
     Three in four have a sun beside which shadows are 3 to 10 times as dark.
     """
-    rng = np.random.default_rng([seed, 21])
+    rng = luck(seed, 21)
     sun = _draw_sun(rng, 0.3, 1.15)
     sunny = rng.random() < 0.75
     ambient = (
         1.0 / float(np.exp(rng.uniform(np.log(3.0), np.log(10.0))))
         if sunny
-        else float(rng.uniform(0.6, 0.95))
+        else rng.uniform(0.6, 0.95)
     )
-    bright = float(rng.uniform(0.6, 1.3) if sunny else rng.uniform(0.9, 1.4))
-    blue = np.array([0.30, 0.52, 0.85]) + rng.uniform(-0.08, 0.08, 3)
+    bright = rng.uniform(0.6, 1.3) if sunny else rng.uniform(0.9, 1.4)
     return Weather(
         sun=sun.astype(np.float32),
         sunshine=(1.0 - ambient) / sun[2],  # a level road has 1 in the sun
         ambient=ambient,
-        zenith=(bright * blue).astype(np.float32),
-        horizon=(bright * (np.array([0.80, 0.86, 0.92]) + rng.uniform(-0.08, 0.08, 3))).astype(
-            np.float32
-        ),
-        clouds=float(rng.uniform(0.0, 0.8) if sunny else rng.uniform(0.6, 1.0)),
-        visibility_m=float(rng.uniform(300.0, 1500.0)),
+        zenith=_draw_tint(rng, (0.30, 0.52, 0.85), 0.08, bright),
+        horizon=_draw_tint(rng, (0.80, 0.86, 0.92), 0.08, bright),
+        clouds=rng.uniform(0.0, 0.8) if sunny else rng.uniform(0.6, 1.0),
+        visibility_m=rng.uniform(300.0, 1500.0),
         exposure=None,
-        saturated=float(rng.uniform(0.04, 0.11) if sunny else rng.uniform(0.0, 0.04)),
-        contrast=float(rng.uniform(1.2, 3.0)),
+        saturated=rng.uniform(0.04, 0.11) if sunny else rng.uniform(0.0, 0.04),
+        contrast=rng.uniform(1.2, 3.0),
     )
 
 
@@ -337,60 +320,51 @@ class Traffic:
     """Moving cars: one ahead of the camera for a while, others oncoming; some may overtake it."""
 
     def __init__(self, drive: Route, seed: int, overtaking: bool = False) -> None:
-        rng = np.random.default_rng([seed, 33])
+        rng = luck(seed, 33)
         self._route = drive
         # offset in lane samples, per frame, to the left in metres, along the lane or against it
         self._courses: list[tuple[float, float, float, float]] = []
-        meets = float(rng.uniform(4.0, 15.0))
+        meets = rng.uniform(4.0, 15.0)
         while meets < len(drive.sample):
-            speed = -float(rng.uniform(0.7, 1.2)) / STEP
-            start = float(drive.sample[int(meets)]) - speed * meets
-            self._courses.append(
-                (start, speed, 2.0 * drive.lane_offset_m + float(rng.uniform(0.0, 0.3)), -1.0)
-            )
-            meets += float(rng.uniform(12.0, 40.0))
+            speed = -rng.uniform(0.7, 1.2) / STEP
+            start = drive.sample[int(meets)] - speed * meets
+            left_m = 2.0 * drive.lane_offset_m + rng.uniform(0.0, 0.3)
+            self._courses.append((start, speed, left_m, -1.0))
+            meets += rng.uniform(12.0, 40.0)
         if overtaking:
-            self._plan_passing(np.random.default_rng([seed, 34]))
-        self._gap = float(rng.uniform(9.0, 14.0)) / STEP
-        self._leader_leaves = float(rng.uniform(0.4, 0.8)) * len(drive.sample)
-        makers = [lambda soup: car(soup, rng, frame_at(0.0, 0.0, 0.0))] * (1 + len(self._courses))
-        self._cars = Moving(rng, makers)
+            self._plan_passing(luck(seed, 34))
+        self._gap = rng.uniform(9.0, 14.0) / STEP
+        self._leader_leaves = rng.uniform(0.4, 0.8) * len(drive.sample)
+        self._cars = Moving(rng, [car] * (1 + len(self._courses)))
 
     def _plan_passing(self, rng: np.random.Generator) -> None:
         """Courses of cars on the camera's left, and of slower ones on its right."""
-        for _ in range(max(1, len(self._route.sample) // 12)):
-            beside = int(rng.integers(len(self._route.sample)))
+        sample = self._route.sample
+        for _ in range(max(1, len(sample) // 12)):
+            beside = int(rng.integers(len(sample)))
             left = rng.random() < 0.75
-            speed = float(rng.uniform(1.15, 1.9) if left else rng.uniform(0.2, 0.8)) / STEP
-            lanes = float(rng.uniform(1.5, 2.1) if left else rng.uniform(-1.1, -0.9))
+            speed = (rng.uniform(1.15, 1.9) if left else rng.uniform(0.2, 0.8)) / STEP
+            lanes = rng.uniform(1.5, 2.1) if left else rng.uniform(-1.1, -0.9)
             left_m = min(self._route.lane_offset_m, WIDEST_LANE_M) * lanes
-            self._courses.append(
-                (float(self._route.sample[beside]) - speed * beside, speed, left_m, 1.0)
-            )
+            self._courses.append((sample[beside] - speed * beside, speed, left_m, 1.0))
 
     def placed(self, index: int) -> list[Mesh]:
         """The cars within sight at a frame, in the street frame."""
         camera = self._route.T_street_camera[index, :3, 3]
         # the one in the camera's lane keeps its distance, until it drives away
         faster = max(0.0, index - self._leader_leaves) * 0.5 / STEP
-        T_street_cars = [self._at(float(self._route.sample[index]) + self._gap + faster, 0.0, 1.0)]
-        T_street_cars += [
-            self._at(start + speed * index, left_m, way)
-            for start, speed, left_m, way in self._courses
-        ]
-        there = {
-            number: T_street_car
-            for number, T_street_car in enumerate(T_street_cars)
-            if T_street_car is not None
-        }
-        away = {
-            number: np.linalg.norm(T_street_car[:3, 3] - camera)
-            for number, T_street_car in there.items()
-        }
-        # nearer only where the drive crosses itself
-        return self._cars.placed(
-            {number: there[number] for number in there if 2.6 < away[number] < 120.0}
-        )
+        leader = self._route.sample[index] + self._gap + faster
+        seen = {}
+        for number, (start, speed, left_m, way) in enumerate(
+            [(leader, 0.0, 0.0, 1.0), *self._courses]
+        ):
+            T_street_car = self._at(start + speed * index, left_m, way)
+            # nearer only where the drive crosses itself
+            if T_street_car is not None and (
+                2.6 < np.linalg.norm(T_street_car[:3, 3] - camera) < 120.0
+            ):
+                seen[number] = T_street_car
+        return self._cars.placed(seen)
 
     def _at(self, sample: float, left_m: float, sense: float) -> FloatArray | None:
         """``T_street_car`` at a lane sample, beside the lane; None beyond its ends."""

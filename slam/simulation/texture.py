@@ -11,25 +11,9 @@ from numpy.typing import NDArray
 from slam.simulation.geometry import Float32Array
 
 Lengths = NDArray[np.floating[Any]]
+Octave = tuple[float, float, float]  # of noise: wavelength along u and along v, metres; amplitude
 
 _SIZE = 256  # lattice cells before the noise repeats
-
-
-@dataclass(frozen=True)
-class Texels:
-    """Texture coordinates of the pixels of one material; every field is ``(N,)``, metres."""
-
-    u: Float32Array  # along the surface
-    v: Float32Array  # across or up the surface
-    u_size: Float32Array  # footprint of the pixel along u
-    v_size: Float32Array  # footprint of the pixel along v
-    shift: Float32Array  # offset of the instance in the noise along u
-    shift_v: Float32Array  # the same along v
-
-
-# unlit RGB (3, N), about [0, 1], of texels by the two colours (2, 3, N) and the parameters
-# (PARAMETERS, N) of instances
-Shader = Callable[[Texels, Float32Array, Float32Array], Float32Array]
 
 
 @functools.cache
@@ -38,7 +22,7 @@ def _lattice() -> Float32Array:
     return np.random.default_rng(20261121).uniform(-1.0, 1.0, _SIZE * _SIZE).astype(np.float32)
 
 
-def value_noise(u: Float32Array, v: Float32Array) -> Float32Array:
+def value_noise(u: Lengths, v: Lengths) -> Lengths:
     """Smooth noise in [-1, 1] with one lattice cell per unit, ``(N,)``."""
     table = _lattice()
     whole_u, whole_v = np.floor(u), np.floor(v)
@@ -58,62 +42,102 @@ def value_noise(u: Float32Array, v: Float32Array) -> Float32Array:
     return top
 
 
-def cell_hash(u: Float32Array, v: Float32Array, salt: int) -> Float32Array:
+def cell_hash(u: Lengths, v: Lengths, salt: int) -> Lengths:
     """A random number in [0, 1] for each integer cell, ``(N,)``."""
     i = (np.floor(u).astype(np.int32) + 37 * salt) & 255
     j = (np.floor(v).astype(np.int32) + 101 * salt) & 255
-    return np.asarray(0.5 + 0.5 * np.take(_lattice(), (i << 8) | j))
+    return 0.5 + 0.5 * np.take(_lattice(), (i << 8) | j)
 
 
-def fractal(texels: Texels, *octaves: tuple[float, float, float]) -> Float32Array:
-    """Sum of noise octaves, each faded out where its waves are smaller than about two pixels.
-
-    An octave is the wavelength along u and along v in metres, and the amplitude.
-    """
-    total = np.zeros_like(texels.u)
-    for k, (wave_u, wave_v, amplitude) in enumerate(octaves):
-        pixels = np.minimum(wave_u / texels.u_size, wave_v / texels.v_size)
-        weight = np.clip((pixels - 1.2) / 1.8, 0.0, 1.0)
-        seen = np.flatnonzero(weight > 0.0)
-        u = (texels.u[seen] + texels.shift[seen]) / wave_u + 17.3 * k
-        v = (texels.v[seen] + texels.shift_v[seen]) / wave_v + 5.7 * k
-        total[seen] += amplitude * weight[seen] * value_noise(u, v)
-    return total
-
-
-def stripes(
-    x: Lengths, size: Lengths, period: Lengths | float, width: Lengths | float
-) -> Float32Array:
-    """Fraction of each pixel of a ``size`` that stripes [k period, k period + width] cover."""
-    half = 0.5 * np.maximum(size, 1e-4)
-
-    def integral(at: Lengths) -> Lengths:
-        whole = np.floor(at / period)
-        return np.asarray(whole * width + np.minimum(at - whole * period, width))
-
-    return np.asarray((integral(x + half) - integral(x - half)) / (2.0 * half))
-
-
-def band(x: Lengths, size: Lengths, low: Lengths | float, high: Lengths | float) -> Float32Array:
-    """Fraction of each pixel covered by the one stripe [low, high]."""
-    inverse = 1.0 / np.maximum(size, 1e-4)
-    return np.asarray(
-        np.clip((x - low) * inverse + 0.5, 0, 1) - np.clip((x - high) * inverse + 0.5, 0, 1)
-    )
-
-
-def mix(
-    a: Lengths | np.floating[Any], b: Lengths | np.floating[Any], fraction: Lengths
-) -> Float32Array:
+def mix(a: Lengths | np.floating[Any], b: Lengths | np.floating[Any], fraction: Lengths) -> Lengths:
     """Blend colours ``(3, N)`` by a weight ``(N,)``."""
     return np.asarray(a + fraction * (b - a), dtype=np.float32)
 
 
-def pixel_size(texels: Texels) -> Float32Array:
-    """The larger extent of each pixel on the surface, metres, ``(N,)``."""
-    return np.maximum(texels.u_size, texels.v_size)
+@dataclass(frozen=True)
+class Axis:
+    """Coordinates of pixels along one axis of a texture; every field is ``(N,)``, metres."""
+
+    at: Lengths  # along the axis
+    size: Float32Array  # footprint of the pixel
+    shift: Lengths  # offset of the instance in the noise
+
+    def on(self, at: Lengths) -> "Axis":
+        """Pixels of the same size at other coordinates ``(N,)``."""
+        return Axis(at, self.size, self.shift)
+
+    def stripes(
+        self, period: Lengths | float, width: Lengths | float, moved: float = 0.0
+    ) -> Lengths:
+        """Fraction of each pixel, moved on, that stripes [k period, k period + width] cover."""
+        half = 0.5 * np.maximum(self.size, 1e-4)
+        x = self.at + moved
+
+        def integral(at: Lengths) -> Lengths:
+            whole = np.floor(at / period)
+            return np.asarray(whole * width + np.minimum(at - whole * period, width))
+
+        return (integral(x + half) - integral(x - half)) / (2.0 * half)
+
+    def band(self, low: Lengths | float, high: Lengths | float) -> Lengths:
+        """Fraction of each pixel covered by the one stripe [low, high]."""
+        inverse = 1.0 / np.maximum(self.size, 1e-4)
+        after, beyond = (np.clip((self.at - edge) * inverse + 0.5, 0, 1) for edge in (low, high))
+        return after - beyond
 
 
-def grained(*octaves: tuple[float, float, float]) -> Shader:
+@dataclass(frozen=True)
+class Texels:
+    """Pixels of one material: where on its texture, and how their instances look."""
+
+    u: Axis  # along the surface
+    v: Axis  # across or up the surface
+    first: Float32Array  # colour of the instance, (3, N)
+    second: Float32Array  # its other colour, (3, N)
+    parameters: Float32Array  # of its texture, (PARAMETERS, N)
+
+    @property
+    def size(self) -> Lengths:
+        """The larger extent of each pixel on the surface, metres, ``(N,)``."""
+        return np.maximum(self.u.size, self.v.size)
+
+    def chosen(self, index: NDArray[np.int64]) -> "Texels":
+        """Some of them."""
+        u, v = (
+            Axis(axis.at[index], axis.size[index], axis.shift[index]) for axis in (self.u, self.v)
+        )
+        tables = (self.first, self.second, self.parameters)
+        return Texels(u, v, *(table[:, index] for table in tables))
+
+    def fractal(self, *octaves: Octave) -> Lengths:
+        """Sum of noise octaves, each faded out where its waves are smaller than about two pixels."""
+        total = np.zeros_like(self.u.at)
+        for k, (wave_u, wave_v, amplitude) in enumerate(octaves):
+            pixels = np.minimum(wave_u / self.u.size, wave_v / self.v.size)
+            weight = np.clip((pixels - 1.2) / 1.8, 0.0, 1.0)
+            seen = np.flatnonzero(weight > 0.0)
+            u = (self.u.at[seen] + self.u.shift[seen]) / wave_u + 17.3 * k
+            v = (self.v.at[seen] + self.v.shift[seen]) / wave_v + 5.7 * k
+            total[seen] += amplitude * weight[seen] * value_noise(u, v)
+        return total
+
+    def joints(
+        self, along: Lengths | float, up: Lengths | float, width: Lengths | float
+    ) -> Lengths:
+        """Coverage by the joints between tiles of a size along u and up v."""
+        return np.maximum(self.u.stripes(along, width), self.v.stripes(up, width))
+
+    def rim(self, border: float) -> Lengths:
+        """Coverage by the border of a thing, whose first parameters are its width and height."""
+        width, height = self.parameters[:2]
+        inside = self.u.band(border, width - border) * self.v.band(border, height - border)
+        return 1.0 - inside
+
+
+# unlit RGB (3, N), about [0, 1], of the pixels of a material
+Shader = Callable[[Texels], Lengths]
+
+
+def grained(*octaves: Octave) -> Shader:
     """One colour under noise."""
-    return lambda texels, colours, _: np.asarray(colours[0] * (1.0 + fractal(texels, *octaves)))
+    return lambda texels: texels.first * (1.0 + texels.fractal(*octaves))

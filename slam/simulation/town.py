@@ -4,18 +4,10 @@ import numpy as np
 
 from slam.geometry import se3
 from slam.simulation import objects
-from slam.simulation.geometry import Bend, FloatArray, Material, Mesh, Soup
+from slam.simulation.geometry import Bend, FloatArray, Mesh, luck, unit
 from slam.simulation.open_land import open_land
-from slam.simulation.route import KERB, StreetPlan
-from slam.simulation.shapes import (
-    Rectangle,
-    colour,
-    corners_of,
-    directed,
-    frame_along,
-    frame_at,
-    grid_over,
-)
+from slam.simulation.route import KERB, Node, StreetPlan
+from slam.simulation.shapes import Rectangle, Site, corners_of, directed, grid_over, lattice
 
 LANE = 3.6  # width on a motorway, metres
 ROUNDING = 5.0  # radius of kerbs at corners, metres
@@ -30,17 +22,17 @@ def build_town(plan: StreetPlan, bend: Bend, seed: int, varied: bool = False) ->
         seed: of the world.
         varied: whether there are railings, posts and people as well.
     """
-    rng = np.random.default_rng([seed, 10])
-    town = _Town(plan, rng, np.random.default_rng([seed, 11]) if varied else None)
+    rng = luck(seed, 10)
+    town = _Town(plan, rng, luck(seed, 11) if varied else None)
     town.ground()
     for i in range(len(plan.xs) - 1):
         for j in range(len(plan.ys) - 1):
             town.block(i, j)
     if plan.kind == "motorway":  # a barrier between the carriageways
-        start, end = float(plan.xs[0]), float(plan.xs[-1])
-        objects.barrier(town.soup, rng, frame_at(start, 0.0, 0.0), end - start, rng.random() < 0.5)
+        start, end = plan.xs[[0, -1]]
+        objects.barrier(town.site.at(start, 0.0), end - start, rng.random() < 0.5)
     town.backdrop()
-    return town.soup.finish(bend)
+    return town.site.finish(bend)
 
 
 class _Town:
@@ -52,35 +44,31 @@ class _Town:
         self.plan = plan
         self.rng = rng
         self.more = more
-        self.soup = Soup(rng)
-        self.density = float(rng.uniform(0.5, 0.9))  # of buildings
-        self.parking = float(rng.uniform(0.1, 0.6))  # of cars along the kerb
-        self.greenery = float(rng.uniform(0.25, 0.8))
-        self.pavement_width = float(rng.uniform(1.6, 2.4))
+        self.site = site = Site(rng)
+        self.density = rng.uniform(0.5, 0.9)  # of buildings
+        self.parking = rng.uniform(0.1, 0.6)  # of cars along the kerb
+        self.greenery = rng.uniform(0.25, 0.8)
+        self.pavement_width = rng.uniform(1.6, 2.4)
         self.tallness = 1.0  # of trees at the kerb
         self.open = plan.kind in ("country", "motorway")  # no houses, no pavements
         self.foot = KERB - (0.1 if more is None else 0.6)  # of houses, below the ground on hills
-        grey = colour(rng, (0.36, 0.36, 0.37), (0.28, 0.28, 0.30), (0.42, 0.41, 0.39), spread=0.03)
-        stone = colour(rng, (0.55, 0.54, 0.52), (0.50, 0.46, 0.43), spread=0.04)
-        turf = colour(rng, (0.26, 0.36, 0.14), (0.34, 0.38, 0.18), spread=0.02)
-        paint = np.array([0.80, 0.80, 0.76])
+        grey = site.colour("asphalt")
+        stone = site.colour("pavement")
+        turf = site.colour("grass")
+        paint = (0.80, 0.80, 0.76)
         dash = rng.uniform(3.0, 6.0)
         fraction = rng.uniform(0.35, 0.6)
         edged = rng.random() < 0.7
         lanes = LANE if plan.kind == "motorway" else 0.0
-        smooth = 0.0 if more is None else float(more.uniform(0.2, 0.85))
-        lines = (plan.half_width, float(dash), float(fraction), float(edged), lanes, smooth)
-        soup = self.soup
-        self.asphalt = soup.instance(Material.ASPHALT, grey, paint, lines)
-        self.junction = soup.instance(
-            Material.JUNCTION, grey, paint, (0.0, 0.0, 0.0, 0.0, 0.0, smooth)
-        )
-        self.pavement = soup.instance(
-            Material.PAVEMENT, stone, 0.7 * stone, (float(rng.uniform(0.5, 1.2)),)
-        )
-        self.kerb = soup.instance(Material.KERB, 1.15 * stone, 0.6 * stone, (1.0,))
-        self.grass = soup.instance(Material.GRASS, turf, 0.55 * turf)
-        self.gravel = soup.instance(Material.GRAVEL, 0.9 * stone, 0.5 * stone)
+        smooth = 0.0 if more is None else more.uniform(0.2, 0.85)
+        lines = (plan.half_width, dash, fraction, edged, lanes, smooth)
+        self.asphalt = site.instance("asphalt", grey, paint, lines)
+        self.junction = site.instance("junction", grey, paint, lines)
+        slab = (rng.uniform(0.5, 1.2),)
+        self.pavement = site.instance("pavement", stone, 0.7, slab)
+        self.kerb = site.instance("kerb", 1.15 * stone, 0.6 * stone)
+        self.grass = site.instance("grass", turf, 0.55)
+        self.gravel = site.instance("gravel", 0.9 * stone, 0.5 * stone)
         if self.open:
             self.pavement = self.kerb = self.grass if rng.random() < 0.6 else self.gravel
         if plan.kind == "avenue":
@@ -88,62 +76,54 @@ class _Town:
 
     def ground(self) -> None:
         """Roads, junctions, and a wide meadow under it all."""
-        xs, ys = self.plan.xs, self.plan.ys
-        self._slab(
-            (xs[0] - 160.0, ys[0] - 160.0, xs[-1] + 160.0, ys[-1] + 160.0), -0.25, self.grass, 8.0
-        )
+        xs, ys = self.plan.xs.tolist(), self.plan.ys.tolist()
+        around = (xs[0] - 160.0, ys[0] - 160.0, xs[-1] + 160.0, ys[-1] + 160.0)
+        self._slab(around, -0.25, self.grass, 8.0)
         half = self.plan.half_width
-        for i in range(len(xs)):
-            for j in range(len(ys)):
-                x, y = float(xs[i]), float(ys[j])
+        reach = half + ROUNDING
+        for i, x in enumerate(xs):
+            for j, y in enumerate(ys):
                 if i + 1 < len(xs):
-                    self._corridor(
-                        (x + half, y - half, float(xs[i + 1]) - half, y + half), (i, j), (i + 1, j)
-                    )
+                    self._corridor((x + half, y - half, xs[i + 1] - half, y + half), (i, j))
                 if j + 1 < len(ys):
-                    self._corridor(
-                        (x - half, y + half, x + half, float(ys[j + 1]) - half), (i, j), (i, j + 1)
-                    )
+                    self._corridor((x - half, y + half, x + half, ys[j + 1] - half), (i, j), True)
                 neighbours = [(i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)]
                 crossed = any(self.plan.is_street((i, j), other) for other in neighbours)
                 rectangle = (x - half, y - half, x + half, y + half)
-                self._slab(
-                    rectangle, 0.0 if crossed else KERB, self.junction if crossed else self.grass
-                )
-                if crossed:
-                    # asphalt outside the rounded kerbs, a hair lower where it runs below the blocks
-                    reach = half + ROUNDING
-                    for x0, x1 in ((x - reach, x - half), (x + half, x + reach)):
-                        for y0, y1 in ((y - reach, y - half), (y + half, y + reach)):
-                            self._slab((x0, y0, x1, y1), -0.005, self.junction)
+                if not crossed:
+                    self._slab(rectangle, KERB, self.grass)
+                    continue
+                self._slab(rectangle, 0.0, self.junction)
+                # asphalt outside the rounded kerbs, a hair lower where it runs below the blocks
+                for x0, x1 in ((x - reach, x - half), (x + half, x + reach)):
+                    for y0, y1 in ((y - reach, y - half), (y + half, y + reach)):
+                        self._slab((x0, y0, x1, y1), -0.005, self.junction)
 
-    def _corridor(self, rectangle: Rectangle, a: tuple[int, int], b: tuple[int, int]) -> None:
-        """A stretch of road between two junctions, or the grass that lies there instead."""
+    def _corridor(self, rectangle: Rectangle, start: Node, north: bool = False) -> None:
+        """A stretch of road from a junction east or north, or the grass that lies there instead."""
         x0, y0, x1, y1 = rectangle
-        if not self.plan.is_street(a, b):
+        if not self.plan.is_street(start, (start[0] + (not north), start[1] + north)):
             self._slab(rectangle, KERB, self.grass)
             return
-        if a[1] == b[1]:
-            points, length = grid_over(rectangle, 0.0, 2.0), x1 - x0
-        else:
+        if north:
             points, length = grid_over((y0, x0, y1, x1), 0.0, 2.0)[..., [1, 0, 2]], y1 - y0
+        else:
+            points, length = grid_over(rectangle, 0.0, 2.0), x1 - x0
         rows, columns = points.shape[:2]
         half = self.plan.half_width
-        v, u = np.meshgrid(
-            np.linspace(-half, half, rows), np.linspace(0.0, length, columns), indexing="ij"
-        )
-        self.soup.patch(points, np.stack([u, v], axis=2), self.asphalt)
+        uv = lattice(np.linspace(0.0, length, columns), np.linspace(-half, half, rows))
+        self.site.patch(points, uv, self.asphalt)
 
     def _slab(self, rectangle: Rectangle, z: float, instance: int, step: float = 3.0) -> None:
         """A level rectangle, textured by its plan coordinates."""
         points = grid_over(rectangle, z, step)
-        self.soup.patch(points, points[..., :2], instance)
+        self.site.patch(points, points[..., :2], instance)
 
     def block(self, i: int, j: int) -> None:
         """One cell of the grid: pavement with kerbs around it, lots inside."""
         plan, half = self.plan, self.plan.half_width
-        x0, x1 = float(plan.xs[i]) + half, float(plan.xs[i + 1]) - half
-        y0, y1 = float(plan.ys[j]) + half, float(plan.ys[j + 1]) - half
+        x0, x1 = plan.xs[i] + half, plan.xs[i + 1] - half
+        y0, y1 = plan.ys[j] + half, plan.ys[j + 1] - half
         nodes = [(i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1)]
         # south, east, north, west
         sides = [plan.is_street(*edge) for edge in zip(nodes, nodes[1:] + nodes[:1])]
@@ -151,7 +131,7 @@ class _Town:
         inner = (x0 + width, y0 + width, x1 - width, y1 - width)
         self._pavement((x0, y0, x1, y1), inner, sides)
         if self.open:
-            open_land(self.soup, self.rng, plan.kind, self.grass, inner, sides)
+            open_land(self.site, plan.kind, self.grass, inner, sides)
             return
         self._slab(inner, KERB, self.grass if self.rng.random() < 0.7 else self.gravel)
         corners = corners_of((x0, y0, x1, y1))
@@ -162,35 +142,31 @@ class _Town:
     def _pavement(self, outer: Rectangle, inner: Rectangle, sides: list[bool]) -> None:
         """A ring of paving between a rounded outline and the lots, and the kerb below its edge."""
         rim, corners = [], corners_of(outer)
-        for k in range(4):
-            here = corners[k]
-            after = corners[(k + 1) % 4]
-            before = corners[k - 1]
+        edges = np.roll(corners, -1, axis=0) - corners
+        for k, (here, ahead) in enumerate(zip(corners, unit(edges))):
             radius = ROUNDING if sides[k] and sides[k - 1] else 0.01
-            ahead = (after - here) / np.linalg.norm(after - here)
-            back = (before - here) / np.linalg.norm(before - here)
+            back = -unit(edges)[k - 1]
             for angle in np.linspace(0.0, np.pi / 2.0, 6):
                 rim.append(
                     here + radius * ((1.0 - np.sin(angle)) * back + (1.0 - np.cos(angle)) * ahead)
                 )
-            reach = float(np.linalg.norm(after - here)) - ROUNDING - 1.0
+            reach = np.linalg.norm(edges[k]) - ROUNDING - 1.0
             rim += [here + along * ahead for along in np.arange(ROUNDING + 2.0, reach, 2.5)]
         edge = np.stack([*rim, rim[0]])
         inside = np.clip(edge, [inner[0], inner[1]], [inner[2], inner[3]])
         ring = np.pad(np.stack([edge, inside]), ((0, 0), (0, 0), (0, 1)), constant_values=KERB)
-        self.soup.patch(ring, ring[..., :2], self.pavement)
+        self.site.patch(ring, ring[..., :2], self.pavement)
         length = se3.distance_along(edge)
         step = ring[[0, 0]].copy()
         step[0, :, 2] = -0.1
-        self.soup.patch(step, np.stack([np.stack([length] * 2), step[..., 2]], axis=2), self.kerb)
+        self.site.patch(step, lattice(length, (-0.1, KERB)), self.kerb)
         lip = ring[[0, 0]].copy()
         lip[..., 2] += 0.004
         towards = inside - edge
         lip[1, :, :2] += (
             0.16 * towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 0.16)
         )
-        across = np.stack([np.zeros_like(length), np.full_like(length, 0.16)])
-        self.soup.patch(lip, np.stack([np.stack([length] * 2), across], axis=2), self.kerb)
+        self.site.patch(lip, lattice(length, (0.0, 0.16)), self.kerb)
 
     def _furnish(self, start: FloatArray, end: FloatArray) -> None:
         """Trees, lamps and signs along a kerb with its block on the left, and cars before it."""
@@ -198,52 +174,42 @@ class _Town:
         length, ahead, inward, angle = directed(start, end)
         along = 6.0
         while along < length - 6.0:
-            spot = start + along * ahead + float(rng.uniform(0.55, 1.0)) * inward
+            x, y = start + along * ahead + rng.uniform(0.55, 1.0) * inward
+            spot = self.site.at(x, y)
             kind = rng.random()
             if kind < 0.45 * self.greenery:
-                objects.tree(
-                    self.soup, rng, spot[0], spot[1], float(rng.uniform(4.0, 8.0)) * self.tallness
-                )
+                objects.tree(spot, rng.uniform(4.0, 8.0) * self.tallness)
             elif kind < 0.55:
-                objects.lamp(self.soup, rng, spot[0], spot[1], -inward)
+                objects.lamp(spot, -inward)
             elif kind < 0.72:
-                objects.sign(self.soup, rng, spot[0], spot[1], angle)
-            along += float(rng.uniform(4.0, 11.0))
+                objects.sign(spot.at(x, y, angle - np.pi / 2.0))
+            along += rng.uniform(4.0, 11.0)
         along = 6.5
         while along < length - 6.5:
             if rng.random() < self.parking:
-                spot = start + along * ahead - 0.95 * inward
-                objects.car(
-                    self.soup, rng, frame_at(spot[0], spot[1], angle + rng.normal(0.0, 0.03))
-                )
-            along += float(rng.uniform(5.4, 7.5))
+                x, y = start + along * ahead - 0.95 * inward
+                objects.car(self.site.at(x, y, angle + rng.normal(0.0, 0.03)))
+            along += rng.uniform(5.4, 7.5)
         if self.more is None:
             return
         # a railing along a part of the kerb, thin posts, and people on the pavement
         rng = self.more
+        site = self.site.drawn_by(rng)
         if rng.random() < 0.45 and length > 16.0:
             first, last = np.sort(rng.uniform(6.0, length - 6.0, 2))
-            foot = start + first * ahead + float(rng.uniform(0.2, 0.8)) * inward
-            objects.railing(
-                self.soup, rng, frame_at(foot[0], foot[1], angle, KERB), float(last - first)
-            )
-        for _ in range(int(rng.poisson(length / 14.0))):
-            spot = (
-                start
-                + rng.uniform(5.0, max(length - 5.0, 6.0)) * ahead
-                + rng.uniform(-0.8, 1.6) * inward
-            )
-            if rng.random() < 0.6:
-                objects.person(self.soup, rng, float(spot[0]), float(spot[1]))
-            else:
-                objects.post(self.soup, rng, float(spot[0]), float(spot[1]))
+            x, y = start + first * ahead + rng.uniform(0.2, 0.8) * inward
+            objects.railing(site.at(x, y, angle, KERB), last - first)
+        for _ in range(rng.poisson(length / 14.0)):
+            walked = rng.uniform(5.0, max(length - 5.0, 6.0))
+            x, y = start + walked * ahead + rng.uniform(-0.8, 1.6) * inward
+            (objects.person if rng.random() < 0.6 else objects.post)(site.at(x, y))
 
     def _split(self, lot: Rectangle, inner: Rectangle, sides: list[bool]) -> None:
         """Cut a lot in two until each piece is of the size of a house."""
         x0, y0, x1, y1 = lot
         width, depth = x1 - x0, y1 - y0
         if max(width, depth) > 17.0:
-            cut = float(self.rng.uniform(0.4, 0.6))
+            cut = self.rng.uniform(0.4, 0.6)
             x, y = (x0 + cut * width, y1) if width > depth else (x1, y0 + cut * depth)
             self._split((x0, y0, x, y), inner, sides)
             self._split((x, y0, x1, y1) if width > depth else (x0, y, x1, y1), inner, sides)
@@ -259,40 +225,39 @@ class _Town:
         rng, (x0, y0, x1, y1) = self.rng, lot
         if min(x1 - x0, y1 - y0) > 5.0 and rng.random() < (self.density if facing else 0.3):
             side = facing[0] if facing else 0
-            front = float(rng.uniform(0.0, 3.0)) if facing else 1.0
-            gap = float(rng.choice([0.02, rng.uniform(0.4, 1.6)]))
+            front = rng.uniform(0.0, 3.0) if facing else 1.0
+            gap = rng.choice([0.02, rng.uniform(0.4, 1.6)])
             width, depth = (x1 - x0, y1 - y0) if side % 2 == 0 else (y1 - y0, x1 - x0)
-            frame = frame_along(lot, side, self.foot)
-            frame[3] += gap * frame[0] + front * frame[1]
-            deep = min(depth - front - 0.2, float(rng.uniform(7.0, 14.0)))
-            objects.building(self.soup, rng, frame, width - 2 * gap, deep)
+            deep = min(depth - front - 0.2, rng.uniform(7.0, 14.0))
+            house = self._along(lot, side, self.foot).moved(gap, front)
+            objects.building(house, width - 2 * gap, deep)
             if front > 1.4 and rng.random() < 0.5:
-                objects.hedge(self.soup, rng, frame_along(lot, side, KERB - 0.05), 0.6 * width)
+                objects.hedge(self._along(lot, side, KERB - 0.05), 0.6 * width)
             return
         for side in facing:
             if rng.random() < 0.6:
-                length = (x1 - x0 if side % 2 == 0 else y1 - y0) * float(rng.uniform(0.5, 1.0))
-                objects.hedge(self.soup, rng, frame_along(lot, side, KERB - 0.05), length)
-        for _ in range(int(rng.poisson(3.0 * self.greenery))):
+                length = (x1 - x0 if side % 2 == 0 else y1 - y0) * rng.uniform(0.5, 1.0)
+                objects.hedge(self._along(lot, side, KERB - 0.05), length)
+        for _ in range(rng.poisson(3.0 * self.greenery)):
             x, y = rng.uniform(x0 + 1.5, x1 - 1.5), rng.uniform(y0 + 1.5, y1 - 1.5)
-            objects.tree(self.soup, rng, float(x), float(y), float(rng.uniform(4.0, 10.0)))
+            objects.tree(self.site.at(x, y), rng.uniform(4.0, 10.0))
+
+    def _along(self, lot: Rectangle, side: int, z: float) -> Site:
+        """The place along a side of a lot, counterclockwise from the south."""
+        x, y = corners_of(lot)[side]
+        return self.site.at(x, y, side * np.pi / 2.0, z)
 
     def backdrop(self) -> None:
         """Trees and houses beyond the edge of town, so that no street ends in the sky."""
-        rng = self.rng
-        xs = self.plan.xs
-        ys = self.plan.ys
+        rng, xs, ys = self.rng, self.plan.xs, self.plan.ys
         corners = corners_of((xs[0], ys[0], xs[-1], ys[-1]))
         for side, start in enumerate(corners):
             length, ahead, inward, _ = directed(start, corners[(side + 1) % 4])
             for along in np.arange(0.0, length, 9.0):
-                spot = (
-                    start + (along + rng.uniform(-3, 3)) * ahead - rng.uniform(6.0, 25.0) * inward
-                )
+                sideways = (along + rng.uniform(-3, 3)) * ahead
+                x, y = start + sideways - rng.uniform(6.0, 25.0) * inward
                 if rng.random() < (1.0 if self.open else 0.7):
-                    objects.tree(self.soup, rng, spot[0], spot[1], float(rng.uniform(6.0, 13.0)))
+                    objects.tree(self.site.at(x, y), rng.uniform(6.0, 13.0))
                 else:
-                    frame = frame_at(spot[0], spot[1], side * np.pi / 2.0 + np.pi, -0.3)
-                    objects.building(
-                        self.soup, rng, frame, float(rng.uniform(8, 14)), float(rng.uniform(7, 11))
-                    )
+                    house = self.site.at(x, y, side * np.pi / 2.0 + np.pi, -0.3)
+                    objects.building(house, rng.uniform(8, 14), rng.uniform(7, 11))

@@ -12,15 +12,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.formats.ply import distances, scene_of
+from slam.formats.ply import Ply, distances, scene_of
 from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.runtime.imports import import_open3d
-from slam.simulation.geometry import Float32Array, FloatArray, Material, Mesh
+from slam.simulation.geometry import MATERIALS, Float32Array, FloatArray, Mesh
 from slam.simulation.options import SimulationOptions
 from slam.simulation.room_textures import ROOM_SHADERS
 from slam.simulation.street_textures import STREET_SHADERS
-from slam.simulation.texture import Texels
+from slam.simulation.texture import Axis, Texels
 
 FARTHEST_M = 200.0  # surfaces beyond are treated as sky
 SHADERS = STREET_SHADERS | ROOM_SHADERS
@@ -41,31 +41,6 @@ class Surface:
         answer = self.scene.cast_rays(import_open3d().core.Tensor(rays))
         return {name: answer[name].numpy() for name in ("t_hit", "primitive_ids", "primitive_uvs")}
 
-    def unlit(self, hits: "Hits", focal_px: float) -> Float32Array:
-        """Colour of each hit under white light, ``(3, N)`` at a focal length in pixels."""
-        mesh = self.mesh
-        tangents = np.take(mesh.tangents, hits.triangle, axis=1)
-        u_size, v_size = _footprint(
-            hits.depth / np.float32(focal_px), hits.rays, hits.normals, tangents
-        )
-        corners = np.take(mesh.uv, hits.triangle, axis=2)  # (3, 2, N)
-        b1, b2 = hits.barycentric
-        u, v = corners[0] + b1 * (corners[1] - corners[0]) + b2 * (corners[2] - corners[0])
-        instance = np.take(mesh.instance, hits.triangle)
-        offsets = np.take(mesh.offsets, instance, axis=1)
-        counts = np.bincount(np.take(mesh.material, hits.triangle), minlength=len(Material))
-        ends = np.cumsum(counts)
-        rgb = np.empty((3, len(hits.triangle)), dtype=np.float32)
-        for kind in np.flatnonzero(counts):
-            part = slice(int(ends[kind] - counts[kind]), int(ends[kind]))
-            texels = Texels(
-                u[part], v[part], u_size[part], v_size[part], offsets[0, part], offsets[1, part]
-            )
-            colours = np.take(mesh.colours, instance[part], axis=2)
-            parameters = np.take(mesh.parameters, instance[part], axis=1)
-            rgb[:, part] = SHADERS[Material(kind)](texels, colours, parameters)
-        return rgb
-
 
 def place_rays(T_scene_sensor: FloatArray, directions: Float32Array) -> Float32Array:
     """Origin and direction in the scene of directions ``(N, 3)`` in a sensor's frame, ``(N, 6)``.
@@ -73,57 +48,66 @@ def place_rays(T_scene_sensor: FloatArray, directions: Float32Array) -> Float32A
     Of several poses ``(H, 4, 4)`` each is that of an equal share of the directions in turn, as of
     the rows of an image.
     """
-    rays = np.empty((len(directions), 6), dtype=np.float32)
-    if T_scene_sensor.ndim == 3:
-        by_row = directions.reshape(len(T_scene_sensor), -1, 3)
-        rays[:, :3] = np.repeat(T_scene_sensor[:, :3, 3], by_row.shape[1], axis=0)
-        rays[:, 3:] = (
-            by_row @ T_scene_sensor[:, :3, :3].swapaxes(1, 2).astype(np.float32)
-        ).reshape(-1, 3)
-        return rays
-    rays[:, :3] = T_scene_sensor[:3, 3]
-    rays[:, 3:] = directions @ T_scene_sensor[:3, :3].T.astype(np.float32)
-    return rays
+    poses = T_scene_sensor.reshape(-1, 4, 4)
+    of_pose = directions.reshape(len(poses), -1, 3)
+    rays = np.empty((*of_pose.shape[:2], 6), dtype=np.float32)
+    rays[..., :3] = poses[:, None, :3, 3]
+    rays[..., 3:] = of_pose @ poses[:, :3, :3].swapaxes(1, 2).astype(np.float32)
+    return rays.reshape(-1, 6)
 
 
 @dataclass(frozen=True)
 class Hits:
-    """Rays that met a mesh, sorted by material."""
+    """Rays that met a surface."""
 
-    triangle: NDArray[np.int64]  # which, (N,)
+    surface: Surface  # that was met
+    triangle: NDArray[np.int64]  # of its mesh, (N,)
     barycentric: Float32Array  # weights of its second and third corner, (2, N)
-    rays: Float32Array  # unit directions in the mesh's frame, (3, N)
+    rays: Float32Array  # origins and directions of z-depth one, (N, 6)
+    directions: Float32Array  # the same of length one, (3, N)
     normals: Float32Array  # unit, turned towards the viewer, (3, N)
     depth: Float32Array  # z-depth, metres, (N,)
-    distance: Float32Array  # along the ray, metres, (N,)
+    pixels: NDArray[np.int64]  # that the rays go through, (N,)
 
+    def unlit(self, focal_px: float) -> Float32Array:
+        """Colour of each under white light, ``(3, N)``, at a focal length in pixels."""
+        mesh = self.surface.mesh
+        u_size, v_size = self._footprint(self.depth / np.float32(focal_px))
+        corners = np.take(mesh.uv, self.triangle, axis=2)  # (3, 2, N)
+        b1, b2 = self.barycentric
+        u, v = corners[0] + b1 * (corners[1] - corners[0]) + b2 * (corners[2] - corners[0])
+        instances = np.take(mesh.instance, self.triangle)
+        materials = np.take(mesh.material, self.triangle)
+        rgb = np.empty((3, len(self.triangle)), dtype=np.float32)
+        for kind in np.unique(materials):
+            part = np.flatnonzero(materials == kind)
+            instance = instances[part]
+            shift_u, shift_v = np.take(mesh.offsets, instance, axis=1)
+            first, second = np.take(mesh.colours, instance, axis=2)
+            texels = Texels(
+                Axis(u[part], u_size[part], shift_u),
+                Axis(v[part], v_size[part], shift_v),
+                first,
+                second,
+                np.take(mesh.parameters, instance, axis=1),
+            )
+            rgb[:, part] = SHADERS[MATERIALS[kind]](texels)
+        return rgb
 
-def _footprint(
-    pixel: Float32Array, rays: Float32Array, normals: Float32Array, tangents: Float32Array
-) -> tuple[Float32Array, Float32Array]:
-    """Extent of a pixel on a surface along its u and v axes, grazing angle included.
+    def _footprint(self, pixel: Float32Array) -> tuple[Float32Array, Float32Array]:
+        """Extent of a pixel on the surface along its u and v axes, grazing angle included.
 
-    A round pixel of size f ``(N,)``, metres at the surface's distance, seen by rays at angle a to
-    the normals is an ellipse of axes f and f / cos a; along a tangent t it extends
-    f sqrt(1 + (ray . t)^2 / cos^2 a). All directions are unit, ``(3, N)``.
-    """
-    cosine = np.abs((rays * normals).sum(axis=0))
-    along_u = (rays * tangents).sum(axis=0)
-    cosine2 = np.maximum(cosine * cosine, 1e-4)
-    u2 = along_u * along_u
-    v2 = np.maximum(1.0 - cosine * cosine - u2, 0.0)
-    return pixel * np.sqrt(1.0 + u2 / cosine2), pixel * np.sqrt(1.0 + v2 / cosine2)
-
-
-@dataclass(frozen=True)
-class SimulatedFrame:
-    """One frame with its truth."""
-
-    index: int  # number of the frame
-    stamp: float  # seconds
-    image: NDArray[np.uint8]  # (H, W, 3) uint8 RGB
-    depth: Float32Array  # z-depth in metres, 0 where nothing was hit, (H, W) float32
-    T_world_camera: FloatArray  # pose in the frame of the first camera, (4, 4)
+        A round pixel of size f ``(N,)``, metres at the surface's distance, seen by rays at angle a
+        to the normals is an ellipse of axes f and f / cos a; along a tangent t it extends
+        f sqrt(1 + (ray . t)^2 / cos^2 a).
+        """
+        tangents = np.take(self.surface.mesh.tangents, self.triangle, axis=1)
+        cosine = np.abs((self.directions * self.normals).sum(axis=0))
+        along_u = (self.directions * tangents).sum(axis=0)
+        cosine2 = np.maximum(cosine * cosine, 1e-4)
+        u2 = along_u * along_u
+        v2 = np.maximum(1.0 - cosine * cosine - u2, 0.0)
+        return pixel * np.sqrt(1.0 + u2 / cosine2), pixel * np.sqrt(1.0 + v2 / cosine2)
 
 
 class SimulatedWorld(ABC):
@@ -165,31 +149,13 @@ class SimulatedWorld(ABC):
     def _moving(self, index: int) -> list[Mesh]:
         """What moves, as it is at a frame."""
 
-    @abstractmethod
     def _background(self, directions: Float32Array) -> Float32Array:
-        """Colour along unit directions that meet nothing, ``(3, N)`` both."""
+        """Colour along unit directions that meet nothing, ``(3, N)`` both: black indoors."""
+        return np.zeros_like(directions)
 
     @abstractmethod
-    def _shade(
-        self,
-        surfaces: list[Surface],
-        number: int,
-        hits: Hits,
-        rays: Float32Array,
-        pixels: NDArray[np.int64],
-    ) -> Float32Array:
-        """Colour of hits on one of the surfaces.
-
-        Args:
-            surfaces: all of a frame.
-            number: which of them is hit.
-            hits: where, N of them.
-            rays: that hit it, ``(N, 6)``.
-            pixels: which the rays go through, ``(N,)``.
-
-        Returns:
-            RGB, about [0, 1], ``(3, N)``.
-        """
+    def _shade(self, hits: Hits, surfaces: list[Surface]) -> Float32Array:
+        """Colour of hits, RGB about [0, 1], ``(3, N)``; the surfaces are all of the frame."""
 
     @abstractmethod
     def _exposures(self, index: int) -> FloatArray:
@@ -206,23 +172,17 @@ class SimulatedWorld(ABC):
         """Number of frames."""
         return self.options.frames
 
-    def render(self, index: int) -> SimulatedFrame:
-        """Image and depth of one frame; the same index gives the same bytes."""
+    def render(self, index: int) -> NDArray[np.uint8]:
+        """RGB image ``(H, W, 3)`` of one frame; the same index gives the same bytes."""
         self._require(index)
-        surfaces, poses = self._surfaces(index), self._exposures(index)
-        views = (self._view(surfaces, T_scene_camera) for T_scene_camera in poses)
-        if len(poses) == 1 and np.array_equal(poses[0], self._T_scene_camera[index]):
-            rgb, depth = next(views)
-        else:
-            rgb, depth = np.mean([view[0] for view in views], axis=0), self.depth(index)
+        surfaces = self._surfaces(index)
+        views = [self._view(surfaces, T_scene_camera) for T_scene_camera in self._exposures(index)]
+        rgb = views[0] if len(views) == 1 else np.mean(views, axis=0)
         levels = self._develop(rgb, index) * np.float32(255.0) + np.float32(0.5)
-        image = np.clip(levels, 0.0, 255.0).astype(np.uint8)
-        return SimulatedFrame(
-            index, index / self.options.rate, image, depth, self.T_world_camera[index].copy()
-        )
+        return np.clip(levels, 0.0, 255.0).astype(np.uint8)
 
     def depth(self, index: int) -> Float32Array:
-        """The z-depth ``(H, W)`` of `render`, without the image."""
+        """The z-depth of one frame in metres, 0 where nothing was hit, ``(H, W)``."""
         self._require(index)
         rays = place_rays(self._T_scene_camera[index], self._rays)
         depth: Float32Array = np.min(
@@ -231,16 +191,16 @@ class SimulatedWorld(ABC):
         depth[depth >= FARTHEST_M] = 0.0
         return depth.reshape(self.options.height, self.options.width)
 
-    def distance_to_surface(self, points_world: NDArray[np.floating[Any]]) -> FloatArray:
+    def distance_to_surface(self, points_world: FloatArray) -> FloatArray:
         """Distance in metres from points ``(M, 3)`` to the nearest static surface, ``(M,)``."""
-        points = se3.apply(self._T_scene_camera[0], np.asarray(points_world, dtype=np.float64))
-        return distances(self._still.scene, points)
+        return distances(self._still.scene, se3.apply(self._T_scene_camera[0], points_world))
 
-    def mesh_world(self) -> tuple[Float32Array, NDArray[np.uint32]]:
-        """What stands still: vertices ``(V, 3)`` in the first camera, triangles ``(T, 3)``."""
-        mesh = self._still.mesh
-        vertices = se3.apply(se3.invert(self._T_scene_camera[0]), mesh.vertices.astype(np.float64))
-        return vertices.astype(np.float32), mesh.triangles
+    def mesh_world(self) -> Ply:
+        """What stands still, in the frame of the first camera."""
+        mesh, T_world_scene = self._still.mesh, se3.invert(self._T_scene_camera[0])
+        points = se3.apply(T_world_scene, mesh.vertices.astype(np.float64)).astype("<f4")
+        vertices = points.view([(axis, "<f4") for axis in "xyz"])[:, 0]
+        return Ply(vertices, mesh.triangles.astype(np.int64))
 
     def scan(self, index: int) -> Float32Array:
         """LiDAR points of a frame ``(M, 4)``: x, y, z in the LiDAR, metres, and reflectance."""
@@ -254,39 +214,28 @@ class SimulatedWorld(ABC):
         """The surfaces at a frame: what stands still, and what moves."""
         return [self._still, *map(Surface, self._moving(index))]
 
-    def _view(
-        self, surfaces: list[Surface], T_scene_camera: FloatArray
-    ) -> tuple[Float32Array, Float32Array]:
-        """Colour ``(H, W, 3)``, about [0, 1], and z-depth ``(H, W)`` from a pose, or one a row."""
+    def _view(self, surfaces: list[Surface], T_scene_camera: FloatArray) -> Float32Array:
+        """Colour ``(H, W, 3)``, about [0, 1], from a pose, or one a row."""
         rays = place_rays(T_scene_camera, self._rays)  # z = 1, so that t is z-depth
         unit = np.ascontiguousarray(rays[:, 3:].T) / self._stretch  # (3, H * W)
         answers = [surface.cast(rays) for surface in surfaces]
         depths = np.stack([answer["t_hit"] for answer in answers])
         nearest, depth = np.argmin(depths, axis=0), depths.min(axis=0)
-        depth[depth >= FARTHEST_M] = 0.0
         rgb = np.empty((len(rays), 3), dtype=np.float32)
-        unseen = np.flatnonzero(depth == 0.0)
+        unseen = np.flatnonzero(depth >= FARTHEST_M)
         rgb[unseen] = self._background(unit[:, unseen]).T
         for number, (surface, answer) in enumerate(zip(surfaces, answers)):
-            seen = np.flatnonzero((nearest == number) & (depth > 0.0))
+            seen = np.flatnonzero((nearest == number) & (depth < FARTHEST_M))
             triangle = answer["primitive_ids"][seen].astype(np.int64)
-            order = np.argsort(np.take(surface.mesh.material, triangle), kind="stable")
-            seen, triangle = seen[order], triangle[order]
-            rays_seen = np.take(unit, seen, axis=1)
+            directions = np.take(unit, seen, axis=1)
             normals = np.take(surface.mesh.normals, triangle, axis=1)
+            normals = np.asarray(normals * -np.sign((normals * directions).sum(axis=0)))
+            barycentric = np.take(answer["primitive_uvs"], seen, axis=0).T
             hits = Hits(
-                triangle=triangle,
-                barycentric=np.take(answer["primitive_uvs"], seen, axis=0).T,
-                rays=rays_seen,
-                normals=np.asarray(
-                    normals * -np.sign((normals * rays_seen).sum(axis=0))
-                ),  # turned towards the viewer
-                depth=depth[seen],
-                distance=depth[seen] * self._stretch[seen],
+                surface, triangle, barycentric, rays[seen], directions, normals, depth[seen], seen
             )
-            rgb[seen] = self._shade(surfaces, number, hits, np.take(rays, seen, axis=0), seen).T
-        shape = self.options.height, self.options.width
-        return rgb.reshape(*shape, 3), depth.reshape(shape)
+            rgb[seen] = self._shade(hits, surfaces).T
+        return rgb.reshape(self.options.height, self.options.width, 3)
 
     def _require(self, index: int) -> None:
         if not 0 <= index < len(self):

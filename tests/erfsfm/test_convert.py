@@ -37,9 +37,7 @@ class OldDeformable(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         mask = 2 * self.modulator_conv(x).sigmoid()
         kernel = self.regular_conv.weight
-        return deform_conv2d(
-            x, self.offset_conv(x), kernel, stride=self.stride, padding=self.padding, mask=mask
-        )
+        return deform_conv2d(x, self.offset_conv(x), kernel, mask, self.stride, self.padding)
 
 
 def _layer(

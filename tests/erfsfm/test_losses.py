@@ -7,12 +7,10 @@ import math
 import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from erfsfm.losses import (
     Bounds,
-    box_mean,
     disagreement,
     dissimilarity,
     edge_aware_smoothness,
@@ -23,27 +21,6 @@ from erfsfm.losses import (
     step_disagreement,
     translation_disagreement,
 )
-
-
-@pytest.mark.parametrize("shape", [(2, 3, 8, 11), (1, 1, 3, 3), (4, 5, 3), (3, 4)])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_box_mean_is_average_pooling(shape: tuple[int, ...], dtype: torch.dtype) -> None:
-    x = torch.randn(shape, dtype=dtype)
-    reference = x.clone().requires_grad_()
-    fast = x.clone().requires_grad_()
-    pooled = F.avg_pool2d(reference.reshape(-1, 1, *shape[-2:]), 3, 1)
-    mean = box_mean(fast)
-    torch.testing.assert_close(mean.reshape(pooled.shape), pooled)
-    weights = torch.randn_like(pooled)
-    (pooled * weights).sum().backward()
-    (mean * weights.reshape(mean.shape)).sum().backward()
-    torch.testing.assert_close(fast.grad, reference.grad)
-
-
-def test_box_mean_gradcheck() -> None:
-    x = torch.randn(2, 5, 6, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(box_mean, (x,))
-    assert torch.autograd.gradgradcheck(box_mean, (x,))
 
 
 def naive_dissimilarity(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -70,14 +47,6 @@ def test_dissimilarity_matches_a_naive_reference() -> None:
                 first[batch, channel].numpy(), second[batch, channel].numpy()
             )
             np.testing.assert_allclose(result[batch, channel].numpy(), expected, atol=1e-12)
-
-
-def test_l1_by_hand() -> None:
-    target = torch.zeros(1, 3, 4, 5)
-    warped = torch.tensor([0.3, 0.6, 0.0]).reshape(1, 3, 1, 1).expand(1, 3, 4, 5)
-    torch.testing.assert_close(
-        photometric_error(target, warped, 0.0), torch.full((1, 1, 4, 5), 0.3)
-    )
 
 
 def test_ssim_of_flat_images_by_hand() -> None:

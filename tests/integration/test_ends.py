@@ -130,10 +130,10 @@ class Recording:
         world = simulated_world(options)
         if self.way not in ("stands", "turns"):
             return [
-                cv2.cvtColor(world.render(k * stride).image, cv2.COLOR_RGB2BGR)
+                cv2.cvtColor(world.render(k * stride), cv2.COLOR_RGB2BGR)
                 for k in range(self.frames)
             ]
-        still, rng = world.render(0).image[:, :, ::-1], np.random.default_rng([self.seed, 79])
+        still, rng = world.render(0)[:, :, ::-1], np.random.default_rng([self.seed, 79])
         found = []
         for k in range(self.frames):
             turn = 0.02 * k if self.way == "turns" else 0.0

@@ -197,11 +197,11 @@ def _odometry_poses(path: Path) -> Any:
 
 
 def _root(path: Path) -> Any:
-    return open_sequence(path.parents[2], "sim", None, None)
+    return open_sequence(path.parents[2], "sim")
 
 
 def _euroc(path: Path) -> Any:
-    return open_sequence(path.parents[2], None, None, None)
+    return open_sequence(path.parents[2])
 
 
 READERS = (
@@ -224,17 +224,9 @@ READERS = (
         lambda T: bool(np.isfinite(T).all()),
     ),
     Reader("TUM poses", "run/trajectory_optimised.tum.txt", read_trajectory, _is_trajectory),
+    Reader("TUM images", "tum/rgb.txt", lambda path: open_sequence(path.parent), _is_sequence),
     Reader(
-        "TUM images",
-        "tum/rgb.txt",
-        lambda path: open_sequence(path.parent, None, None, None),
-        _is_sequence,
-    ),
-    Reader(
-        "folder times",
-        "folder/times.txt",
-        lambda path: open_sequence(path.parent, None, None, None),
-        _is_sequence,
+        "folder times", "folder/times.txt", lambda path: open_sequence(path.parent), _is_sequence
     ),
     Reader("EuRoC images", "euroc/mav0/cam0/data.csv", _euroc, _is_sequence),
     Reader("EuRoC camera", "euroc/mav0/cam0/sensor.yaml", _euroc, _is_sequence),

@@ -61,15 +61,13 @@ class LiveMap:
             RunError: no ground below the cameras, or too many cells.
         """
         points = self.points(T_map_camera)
-        ground, grid = (
-            ground_along(points, T_map_camera, camera_height),
-            Grid.around(points, self.resolution),
-        )
+        ground_at = ground_along(points, T_map_camera, camera_height)
+        grid = Grid.around(points, self.resolution)
         seen, occupied = np.zeros(grid.width * grid.height), np.zeros(grid.width * grid.height)
         for frame, cloud in self.clouds.items():
             X = apply(T_map_camera[frame], cloud)
             cells, which = np.unique(grid.cells(X), return_inverse=True)
-            above = (X[:, 2] - ground.heights(grid.centres(cells))[which]) / metre
+            above = (X[:, 2] - ground_at(grid.centres(cells))[which]) / metre
             standing = (above >= OBSTACLE_FROM_M) & (above <= OBSTACLE_TO_M)
             stands = np.bincount(which[standing], minlength=len(cells)) >= _LEAST_STANDING
             lies = np.bincount(which[np.abs(above) < OBSTACLE_FROM_M], minlength=len(cells)) > 0

@@ -26,17 +26,14 @@ _ROTATION_SIGMA_DEG = 0.1  # least rotation sigma of a factor, degrees
 
 @dataclass(frozen=True)
 class KeyframePoses:
-    """Relative ``poses`` and ``loops`` in the units of their maps.
+    """Relative ``poses`` and ``loops`` in the unit of learned depth, of all maps alike where they see one floor.
 
-    ``segments`` is the number of the map of every frame that has a pose in one, ``learned_units``
-    the unit of learned depth per unit of each map, by its number: of all maps alike, where they see
-    one floor.
+    ``segments`` is the number of the map of every frame that has a pose in one.
     """
 
     poses: Sequence[RelativePose] = ()
     segments: Mapping[int, int] = field(default_factory=dict)
     loops: Sequence[RelativePose] = ()
-    learned_units: Mapping[int, float] = field(default_factory=dict)
 
     @cached_property
     def component(self) -> Mapping[int, int]:
@@ -76,12 +73,12 @@ class KeyframePoses:
         )
 
     def length(self, first: int, last: int) -> float | None:
-        """The distance of two frames in the unit of learned depth; None where no map has both."""
+        """The distance of two frames; None where no map has both."""
         number = self.segments.get(first)
         if number is None or number != self.segments.get(last):
             return None
         apart = self.T_map_camera[last][:3, 3] - self.T_map_camera[first][:3, 3]
-        return self.learned_units[number] * float(np.linalg.norm(apart))
+        return float(np.linalg.norm(apart))
 
     @cached_property
     def T_map_camera(self) -> dict[int, FloatArray]:
@@ -109,13 +106,15 @@ def keyframe_poses(
     turns: list[RelativePose] = []
     maps = [segment for segment in maps if segment.started]
     learned = [learned_unit(segment) for segment in maps]
-    for number, segment in enumerate(maps):
+    units = units_by_floor(maps, learned, seed)
+    for number, (segment, unit) in enumerate(zip(maps, units, strict=True)):
         located = _segment_poses(segment, intrinsics, seed)
-        poses += located
+        poses += [pose.scaled(unit) for pose in located]
         for pose in located:
             segments[pose.from_index] = segments[pose.to_index] = number
-        turns += [turn.scaled(1.0 / learned[number]) for turn in segment.turns]
-        closing |= _loop_poses(segment, loops, intrinsics, seed)
+        turns += [turn.scaled(unit / learned[number]) for turn in segment.turns]
+        for ends, loop in _loop_poses(segment, loops, intrinsics, seed).items():
+            closing[ends] = loop.scaled(unit)
     outside = [
         turn
         for turn in turns
@@ -123,8 +122,7 @@ def keyframe_poses(
     ]
     _connect(segments, outside)
     poses += [turn for turn in outside if turn.from_index in segments]
-    units = units_by_floor(maps, learned, seed)
-    return KeyframePoses(poses, segments, [closing[ends] for ends in loops], dict(enumerate(units)))
+    return KeyframePoses(poses, segments, [closing[ends] for ends in loops])
 
 
 def _connect(segments: dict[int, int], turns: Sequence[RelativePose]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import solveh_banded
 
 from slam.frontend.keyframes.local_map import LocalMap
-from slam.geometry.robust import mad_sigma
+from slam.geometry.robust import difference_equations, mad_sigma
 from slam.geometry.se3 import FloatArray
 
 _LEAST_DEPTHS = 20
@@ -63,12 +63,16 @@ def learned_units(local: LocalMap, carried: FloatArray) -> tuple[FloatArray, Flo
         usual = float(np.clip(mad_sigma(apart) / np.sqrt(2.0), _LEAST_SIGMA, _SIGMA))
     weight = np.where(np.isfinite(own), 0.5 / _SHARED / usual**2, 0.0)
     own = np.nan_to_num(own)
-    system = np.zeros((2, len(own)))
-    system[1] = weight
-    system[0, 1:] = -(carried**-2.0)
-    system[1, 1:] += carried**-2.0
-    system[1, :-1] += carried**-2.0
-    walk = np.asarray(solveh_banded(system[-len(own) :], weight * own))
+    units = np.arange(len(own))
+    zero = np.full(len(own), len(own))  # behind the last unit
+    information, right = difference_equations(
+        np.concatenate([units[1:], units]),
+        np.concatenate([units[:-1], zero]),
+        np.concatenate([0.0 * carried, own]),
+        np.concatenate([carried**-2.0, weight]),
+        0.0 * own,
+    )
+    walk = np.asarray(solveh_banded(information[-len(own) :], right))
     return np.exp(walk), np.exp(np.where(weight > 0.0, walk - own, 0.0))
 
 

@@ -49,6 +49,9 @@ _SEEN_WITHIN = 40.0
 _NEAR_PERCENT = 10
 _HALF_FIELD = np.array([0.9, 0.5])  # tangents, of width and height
 
+Mesh = tuple[FloatArray, NDArray[np.uint8], NDArray[np.int64]]
+"""Vertices ``(V, 3)`` in the world, y down, their RGB colours ``(V, 3)``, and triangles ``(T, 3)``."""
+
 
 def trajectories_figure(
     trajectories: Mapping[str, Trajectory], unit: str, loops: Sequence[AcceptedLoop] = ()
@@ -82,10 +85,10 @@ def trajectories_figure(
 
 def map_figure(view: MapView) -> go.Figure:
     """The map in its colours with the camera's path through it, seen first from one of its places."""
-    points = view.mesh.points @ R_UP_WORLD.T
+    points = view.points @ R_UP_WORLD.T
     path = view.T_world_camera[:, :3, 3] @ R_UP_WORLD.T
-    corners = view.mesh.triangles.astype(np.uint16 if len(points) < 2**16 else np.int32)
-    colours = [f"#{rgb:06x}" for rgb in view.mesh.colours.astype(np.int64) @ [1 << 16, 1 << 8, 1]]
+    corners = view.triangles.astype(np.uint16 if len(points) < 2**16 else np.int32)
+    colours = [f"#{rgb:06x}" for rgb in view.colours.astype(np.int64) @ [1 << 16, 1 << 8, 1]]
     flat = {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0, "fresnel": 0.0}
     figure = go.Figure(
         go.Mesh3d(
@@ -142,9 +145,9 @@ def drift_figure(trajectories: Mapping[str, Trajectory]) -> go.Figure:
     figure = _panels("translation (%)", "rotation (deg / 100 m)")
     for name, estimate, truth in paired(trajectories):
         segments = segment_errors(estimate.T_world_camera, truth.T_world_camera, FIGURE_LENGTHS_M)
-        lengths = np.array([each.length_m for each in segments])
-        percent = 100.0 * np.array([each.translation_m.mean() for each in segments]) / lengths
-        degrees = 100.0 * np.rad2deg([each.rotation.mean() for each in segments]) / lengths
+        lengths = np.array([length_m for length_m, _, _ in segments])
+        percent = 100.0 * np.array([shift_m.mean() for _, shift_m, _ in segments]) / lengths
+        degrees = 100.0 * np.rad2deg([turn.mean() for _, _, turn in segments]) / lengths
         look = {"mode": "lines+markers"}
         figure.add_trace(_line(name, lengths, percent, None, "%{y:.2f} % of %{x} m", **look), 1, 1)
         words = "%{y:.3f} deg / 100 m over %{x} m"
@@ -274,20 +277,13 @@ def _single(values: FloatArray) -> Any:
 
 
 @dataclass(frozen=True)
-class MapMesh:
-    """Vertices ``(V, 3)`` in the world, y down, their RGB colours ``(V, 3)`` uint8, and triangles ``(T, 3)``."""
+class MapView:
+    """A `Mesh`, the poses of the camera ``(N, 4, 4)`` in its world, the ``frame`` from which it
+    is seen first, and how far ``ahead`` of it the map is near."""
 
     points: FloatArray
     colours: NDArray[np.uint8]
     triangles: NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class MapView:
-    """A surface, the poses of the camera ``(N, 4, 4)`` in its world, the ``frame`` from which it is seen first, and how
-    far ``ahead`` of it the map is near."""
-
-    mesh: MapMesh
     T_world_camera: FloatArray
     frame: int
     ahead: float
@@ -301,18 +297,18 @@ def map_view(folder: RunFolder, triangles: int = _TRIANGLES) -> MapView | None:
     trajectory = folder.trajectory("optimised")
     if trajectory is None or not (folder.path / MAP_MESH).is_file():
         return None
-    mesh = thinned_mesh(folder.path / MAP_MESH, triangles)
+    points, colours, corners = thinned_mesh(folder.path / MAP_MESH, triangles)
     poses = trajectory.T_world_camera
     frames = np.unique(
         np.linspace(0, len(poses) - 1, _CANDIDATES + 2)[1:-1].round().astype(int)
     ).tolist()
-    depths = [_depths(mesh.points, poses[frame]) for frame in frames]
+    depths = [_depths(points, poses[frame]) for frame in frames]
     best = int(np.argmax([np.count_nonzero(z < _SEEN_WITHIN) for z in depths]))
     ahead = float(np.percentile(depths[best], _NEAR_PERCENT)) if len(depths[best]) else _SEEN_WITHIN
-    return MapView(mesh, poses, frames[best], ahead)
+    return MapView(points, colours, corners, poses, frames[best], ahead)
 
 
-def thinned_mesh(path: Path, triangles: int) -> MapMesh:
+def thinned_mesh(path: Path, triangles: int) -> Mesh:
     """A ``map_mesh.ply`` with at most about so many triangles, by quadric errors; a large one is clustered first."""
     mesh = import_open3d().io.read_triangle_mesh(str(path))
     if not mesh.has_triangles():
@@ -330,7 +326,7 @@ def thinned_mesh(path: Path, triangles: int) -> MapMesh:
         else np.full_like(mesh.vertices, 0.5)
     )
     rgb = np.rint(255.0 * np.clip(colours, 0.0, 1.0)).astype(np.uint8)
-    return MapMesh(np.asarray(mesh.vertices), rgb, np.asarray(mesh.triangles).astype(np.int64))
+    return np.asarray(mesh.vertices), rgb, np.asarray(mesh.triangles).astype(np.int64)
 
 
 def _depths(points: FloatArray, T_world_camera: FloatArray) -> FloatArray:

@@ -89,21 +89,12 @@ def test_the_papers_flip_is_one_pixel_off() -> None:
     )
 
 
-def test_the_papers_zoom_multiplies_the_camera_before_sizes_are_rounded() -> None:
-    images = [np.zeros((96, 160, 3), np.uint8)]
-    _, _, camera, _ = augment(
-        images, [], CAMERA, DataConfig(flip=0, zoom=1.15), "paper", np.random.default_rng(7)
-    )
-    rng = np.random.default_rng(7)
-    rng.random()
-    zoom_x, zoom_y = rng.uniform(1, 1.15, 2)
-    left, top = (
-        int(rng.integers(int(side * zoom) - side + 1))
-        for side, zoom in ((160, zoom_x), (96, zoom_y))
-    )
-    assert left > 0 and top > 0
-    assert (camera.fx, camera.cx) == (110 * zoom_x, 77 * zoom_x - left)
-    assert (camera.fy, camera.cy) == (120 * zoom_y, 50 * zoom_y - top)
+@pytest.mark.parametrize(("fidelity", "rounded"), [("default", True), ("paper", False)])
+def test_the_papers_zoom_multiplies_the_camera_before_sizes_are_rounded(fidelity, rounded) -> None:
+    images, config = [np.zeros((96, 160, 3), np.uint8)], DataConfig(flip=0, zoom=1.15)
+    _, _, camera, _ = augment(images, [], CAMERA, config, fidelity, np.random.default_rng(7))
+    sizes = np.array([160 * camera.fx / CAMERA.fx, 96 * camera.fy / CAMERA.fy])
+    assert (np.abs(sizes - sizes.round()) < 1e-9).all() == rounded and (sizes > [160, 96]).all()
 
 
 @pytest.mark.parametrize("seed", range(6))

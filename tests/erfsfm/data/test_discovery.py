@@ -81,7 +81,6 @@ def test_simulated_root_is_named_by_its_seed(
     assert recording.name == "simulated/17"
     assert recording.frames_name == "simulated/17[0:3]"
     depth = recording.true_depth(1)
-    assert depth is not None
     assert depth.dtype == np.float32
     assert float(depth[0, 0]) == pytest.approx(5.9, abs=1 / 256)
 
@@ -102,8 +101,6 @@ def test_poses_and_parts(tmp_path: Path, write_root: Callable[..., Path]) -> Non
     assert (part.start, part.frames_name) == (2, "kitti_odometry/00[2:5]")
     assert part.part(1, 3).frames_name == "kitti_odometry/00[3:5]"
     poses, depth = part.true_poses(), part.true_depth(0)
-    assert poses is not None
-    assert depth is not None
     np.testing.assert_allclose(poses[:, 2, 3], [1.0, 1.5, 2.0])
     assert float(depth[0, 0]) == pytest.approx(5.0)
     assert (part.image(0, 64, 96) == whole.image(2, 64, 96)).all()
@@ -120,8 +117,6 @@ def test_poses_are_those_of_the_camera_that_took_the_images(
     recording = one(tmp_path)
     assert recording.t_camera_cam0 == pytest.approx((0.5, 0, 0))
     poses, paper = recording.true_poses(), recording.true_poses("paper")
-    assert poses is not None
-    assert paper is not None
     np.testing.assert_allclose(poses[:, :3, 3], [[-0.5, 0, 0], [3, 0, -0.5]], atol=1e-12)
     np.testing.assert_allclose(paper[:, :3, 3], [[0, 0, 0], [3, 0, 0]])
 

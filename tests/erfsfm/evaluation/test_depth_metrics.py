@@ -19,7 +19,6 @@ from erfsfm.evaluation.depth_metrics import (
 def test_perfect_up_to_scale() -> None:
     truth = np.random.default_rng(0).uniform(1, 70, (6, 8)).astype(np.float32)
     errors = depth_errors(truth / 7, truth)
-    assert errors is not None
     assert errors.scale == pytest.approx(7, rel=1e-6)
     assert errors.abs_rel == pytest.approx(0, abs=1e-6)
     assert errors.rmse == pytest.approx(0, abs=1e-4)
@@ -30,7 +29,6 @@ def test_by_hand_without_scaling() -> None:
     truth = np.array([[10.0, 20.0, 0.0]], np.float32)
     guess = np.array([[12.0, 10.0, 5.0]], np.float32)
     errors = depth_errors(guess, truth, scaling=1.0)
-    assert errors is not None
     assert errors.scale == 1
     assert errors.abs_rel == pytest.approx((0.2 + 0.5) / 2)
     assert errors.sq_rel == pytest.approx((4 / 10 + 100 / 20) / 2)
@@ -43,7 +41,6 @@ def test_scaled_predictions_are_clipped_afterwards() -> None:
     truth = np.array([[10.0, 10.0, 79.0]], np.float32)
     guess = np.array([[1.0, 1.0, 1000.0]], np.float32)
     errors = depth_errors(guess, truth)
-    assert errors is not None
     assert errors.scale == 10
     assert errors.rmse == pytest.approx(math.sqrt(1 / 3)), "80 against 79, not 10000"
 

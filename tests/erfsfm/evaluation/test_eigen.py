@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.config import NetworkConfig
-from erfsfm.evaluation.depth_metrics import depth_errors
 from erfsfm.evaluation.eigen import RawFrame, displacements, eigen_protocol, lidar_depth, read_split
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.model_record import ModelRecord
@@ -127,18 +126,6 @@ def test_the_eigen_list(tmp_path: Path) -> None:
     odometry = [f"kitti_odometry/{sequence:02d}" for sequence in range(11)]
     assert len(overlapping([frame.name for frame in frames], odometry)) == 99
     assert len(overlapping([f"kitti_raw/{frame.drive}" for frame in frames], odometry)) == 100
-
-
-def test_a_given_scale_and_clipping_by_hand() -> None:
-    truth, guess = np.array([[10.0, 60.0]], np.float32), np.array([[3.0, 100.0]], np.float32)
-    before = depth_errors(guess, truth, scaling=2.0, clipping="before")
-    after = depth_errors(guess, truth, scaling=2.0)
-    assert before is not None
-    assert after is not None
-    assert before.abs_rel == pytest.approx((0.4 + 100 / 60) / 2), (
-        "80 doubled, and not clipped again"
-    )
-    assert after.abs_rel == pytest.approx((0.4 + 20 / 60) / 2)
 
 
 @pytest.mark.data

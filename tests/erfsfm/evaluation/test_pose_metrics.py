@@ -15,6 +15,7 @@ from erfsfm.evaluation.pose_metrics import (
     snippet_from_network,
     snippets_from_trajectory,
 )
+from slam.formats.trajectory import read_trajectory
 
 Poses = NDArray[np.float64]
 
@@ -132,10 +133,11 @@ def test_scores_of_public_trajectories(
     mean_motion: tuple[float, ...],
 ) -> None:
     """DF-VO's stereo-trained trajectories, and the two constant motions that every network must beat."""
-    T_world_camera = read_kitti(data_root / "golden" / f"reference_{sequence}.txt")
+    golden = data_root / "golden"
+    T_world_camera = read_trajectory(golden / f"reference_{sequence}.txt").T_world_camera
     true = snippets_from_trajectory(T_world_camera)
     dfvo = snippets_from_trajectory(
-        read_kitti(data_root / "golden" / f"dfvo_stereo_{sequence}.txt")
+        read_trajectory(golden / f"dfvo_stereo_{sequence}.txt").T_world_camera
     )
     assert printed(snippet_errors(dfvo, true)) == stereo
     assert (
@@ -148,10 +150,3 @@ def test_scores_of_public_trajectories(
     step[:3, 3] = steps[:, :3, 3].mean(axis=0)
     constant = np.stack([np.linalg.matrix_power(step, k) for k in range(5)])
     assert printed(snippet_errors(np.tile(constant, (len(true), 1, 1, 1)), true)) == mean_motion
-
-
-def read_kitti(path: Path) -> Poses:
-    rows = np.loadtxt(path).reshape(-1, 3, 4)
-    T_world_camera = np.tile(np.eye(4), (len(rows), 1, 1))
-    T_world_camera[:, :3] = rows
-    return T_world_camera

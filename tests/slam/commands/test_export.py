@@ -14,6 +14,7 @@ import pytest
 import yaml
 from meshes import coloured_ply
 
+from erfsfm.common.readers.camera_file import read_camera_file
 from slam.commands.cli import app
 from slam.commands.export import R_UP_WORLDS, export
 from slam.formats.ply import Ply, read_ply, write_ply
@@ -196,7 +197,6 @@ def test_corners_are_tracked_through_the_images(
     points, images = rows(model / "points3D.txt"), rows(model / "images.txt")
     assert len(points) > 100 and len(images) == 2 * FRAMES
     X: FloatArray = np.array([point[1:4] for point in points], float)
-    assert street.reference is not None
     seen = 0
     for k, point in enumerate(points):
         for image, corner in zip(map(int, point[8::2]), map(int, point[9::2]), strict=True):
@@ -264,6 +264,8 @@ def test_images_of_a_lens_are_undistorted(make_recorded: MakeRecorded, tmp_path:
     folder.write(PLACES, Places(camera, (), np.zeros((0, 4, 4))).write)
     content = scene(export(folder, "nerfstudio", tmp_path / "scene"))
     assert content["fl_x"] == camera.fx and content["k1"] == 0
+    written = read_camera_file(tmp_path / "scene" / "camera.yaml")  # for erfsfm train
+    assert written.fx == camera.fx and not written.is_distorted
 
 
 def test_frames_without_a_usable_image_are_left_out(
@@ -304,7 +306,6 @@ def test_interpolated_frames_are_no_images_of_a_colmap_model(
 def test_a_run_of_a_part_finds_its_frames(make_recorded: MakeRecorded, tmp_path: Path) -> None:
     folder = make_recorded()
     trajectory = folder.trajectory("optimised")
-    assert trajectory is not None
     folder.write_trajectory(
         "optimised", Trajectory(trajectory.stamps[3:6], trajectory.T_world_camera[3:6], True)
     )
@@ -332,7 +333,6 @@ def test_images_that_have_gone_are_one_line_and_a_new_place_is_taken(
     written = export(folder, "nerfstudio", tmp_path / "scene", "z", dataset=tmp_path / "elsewhere")
     assert len(scene(written)["frames"]) == 8
     trajectory = folder.trajectory("optimised")
-    assert trajectory is not None
     folder.write_trajectory(
         "optimised", Trajectory(trajectory.stamps + 100, trajectory.T_world_camera, True)
     )

@@ -328,7 +328,6 @@ def test_a_signal_leaves_a_whole_run(
     with subprocess.Popen(
         command, stdout=pipe, stderr=pipe, text=True, preexec_fn=heeded
     ) as process:
-        assert process.stdout is not None
         for _ in range(FRAMES):
             messages.append(json.loads(process.stdout.readline()))
         process.send_signal(number)

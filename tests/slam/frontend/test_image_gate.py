@@ -28,7 +28,7 @@ HAZARDS = [
 @functools.cache
 def street(hazards: tuple[str, ...] = ()) -> list[Image]:
     drive = SimulatedStreet(SimulationOptions("loop", 250, 704, 208, 64, hazards))
-    return [drive.render(k).image for k in range(40, 40 + STREET)]
+    return [drive.render(k) for k in range(40, 40 + STREET)]
 
 
 def noise(seed: int) -> Image:
@@ -160,7 +160,7 @@ def test_a_simulated_stop_is_not_frozen() -> None:
     drive = SimulatedStreet(SimulationOptions("straight", 60, 704, 104, 32, ("stop",)))
     steps = np.linalg.norm(np.diff(drive.T_world_camera[:, :3, 3], axis=0), axis=1)
     assert (steps < 1e-9).sum() >= 10 and (steps > 0.5).sum() >= 10
-    images = [jpeg(drive.render(k).image, 60 + k % 28) for k in range(60)]
+    images = [jpeg(drive.render(k), 60 + k % 28) for k in range(60)]
     assert set(verdicts(images)) == {"new"}
 
 

@@ -43,7 +43,6 @@ def test_the_path_of_simulated_scans_is_the_camera_s(street, tmp_path):
         sequence.paths[k] = tmp_path / f"{k:06d}.bin"
         street.scan(k).tofile(sequence.paths[k])
     path = lidar_path(sequence)
-    assert path is not None
     np.testing.assert_array_equal(path.frames, np.arange(FRAMES))
     np.testing.assert_allclose(path.T_world_camera[0], np.eye(4), atol=1e-12)
     travelled = np.linalg.norm(street.T_world_camera[-1, :3, 3])

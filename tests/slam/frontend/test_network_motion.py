@@ -57,18 +57,10 @@ def test_chain_uses_target_to_next_and_nothing_else():
     np.testing.assert_allclose(inner, se3.invert(T[2:-2]) @ T[3:-1], atol=1e-9)
     # the ends come from the direct poses, which are wrong here
     first, last = snippets[0], snippets[-1]
-    np.testing.assert_allclose(
-        se3.invert(chained[0]) @ chained[2], first.T_source_target[0], atol=1e-9
-    )
-    np.testing.assert_allclose(
-        se3.invert(chained[1]) @ chained[2], first.T_source_target[1], atol=1e-9
-    )
-    np.testing.assert_allclose(
-        se3.invert(chained[11]) @ chained[9], last.T_source_target[3], atol=1e-9
-    )
-    np.testing.assert_allclose(
-        se3.invert(chained[10]) @ chained[9], last.T_source_target[2], atol=1e-9
-    )
+    for snippet, target, sources in ((first, 2, {0: 0, 1: 1}), (last, 9, {2: 10, 3: 11})):
+        for row, source in sources.items():
+            T_source_target = se3.invert(chained[source]) @ chained[target]
+            np.testing.assert_allclose(T_source_target, snippet.T_source_target[row], atol=1e-9)
 
 
 def test_a_step_that_several_snippets_see_is_their_mean():

@@ -22,8 +22,6 @@ from slam.frontend.scale import (
     find_scale,
     gather_evidence,
     marginals,
-    scale_from_road,
-    scale_track,
     solve_lengths,
 )
 from slam.frontend.visual.motion import Motion
@@ -163,18 +161,18 @@ def test_steps_that_skip_frames_have_lengths_by_their_two_frames():
 
 
 def test_lengths_by_learned_depth_alone_have_the_unit_at_their_first_frames():
-    """The unit of learned depth drifts by a tenth."""
+    """The unit of learned depth drifts by half, of which planes of 20 steps alone see a little."""
     steps = [(k, k + 3) for k in range(0, FRAMES - 1, 3)]
-    drifting = np.linspace(1.0, 1.1, FRAMES)
+    drifting = np.linspace(1.0, 1.5, FRAMES)
     planes = [HEIGHT_M * UNIT / unit for unit in drifting]
     scale = find(
         "camera-height",
         (replace(measured(road=False, steps=steps)[0], measured=Measured(roads=planes)), []),
     )
-    assert scale.per_frame[-1] > 1.03 * scale.per_frame[0]
+    assert scale.per_frame[-1] > 1.005 * scale.per_frame[0]
     for ends in steps:
         assert scale.lengths[ends].value == pytest.approx(
-            scale.per_frame[ends[0]] * UNIT * metres(ends), rel=1e-4
+            scale.per_frame[ends[0]] * UNIT * metres(ends), rel=1e-5
         )
 
 
@@ -229,18 +227,6 @@ def test_lengths_have_the_unit_that_was_measured(mode, road, unit):
     assert scale.in_metres(ScaleEstimate(2.0, 0.1, 9)).unit == "metres"
 
 
-def test_the_scale_track_follows_a_drifting_unit_across_frames_without_a_plane():
-    heights = np.where(np.arange(200) < 100, 0.50, 0.52)
-    roads = heights.tolist()
-    roads[10:40] = [Failed("no road")] * 30
-    estimate = scale_from_road(roads, 1.0)
-    track = scale_track(roads, 1.0, estimate)
-    assert track.shape == (200,)
-    assert track[0] == pytest.approx(2.0)
-    assert track[60] == pytest.approx(2.0)
-    assert track[-1] == pytest.approx(1 / 0.52)
-
-
 def evidence(**measured: np.ndarray) -> StepEvidence:
     return replace(StepEvidence.empty(STEPS), **measured)
 
@@ -272,15 +258,6 @@ def test_triangulation_propagates_rare_road_lengths_through_the_drive():
     solved = solve_lengths(measured)
     np.testing.assert_allclose(solved.length, TRUE, rtol=0.05)
     np.testing.assert_allclose(solved.unit_correction, 0.5, rtol=0.1)
-
-
-def test_a_noisy_road_is_better_with_triangulation_than_without():
-    absolute = {"absolute": noisy(0.05), "absolute_sigma": np.full(STEPS, 0.06)}
-    alone = solve_lengths(evidence(**absolute)).length
-    together = solve_lengths(evidence(**absolute, **ratios(0.003))).length
-    errors = [np.sqrt(np.mean(np.log(lengths / TRUE) ** 2)) for lengths in (alone, together)]
-    assert errors[0] > 0.03
-    assert errors[1] < 0.4 * errors[0]
 
 
 def test_a_quarter_of_wrong_roads_does_not_matter():
@@ -388,12 +365,25 @@ def test_sigmas_are_those_of_the_errors_of_lengths(monkeypatch: pytest.MonkeyPat
     assert np.mean(sigmas, axis=0)[80] > 1.5 * np.mean(sigmas, axis=0)[30]
 
 
+def test_planes_hold_the_unit_where_the_road_gives_few_lengths() -> None:
+    """The unit of learned depth drifts by half, ratios by chance, and the road is seen in ten steps alone."""
+    drift = np.linspace(0.0, 0.4, STEPS)
+    road = np.where(np.arange(STEPS) < 10, np.log(TRUE), np.nan)
+    known = ratios(0.01) | {"learned": np.log(TRUE) + drift, "absolute": road}
+    known["absolute_sigma"] = np.full(STEPS, 0.06)
+    alone, by_planes = (
+        np.log(solve_lengths(evidence(**known, plane=plane)).length / TRUE)[-1]
+        for plane in (np.full(STEPS, np.nan), -drift)
+    )
+    assert abs(by_planes) < 0.5 * abs(alone)
+
+
 def driven(metres: np.ndarray) -> StepEvidence:
     """Steps of a tenth of a second, their lengths by learned depth alone."""
     links = [(k, k + 1) for k in range(len(metres))]
     motions = {ends: motion(ends, metres[ends[0]], 0.1, 1.0, seconds=0.1) for ends in links}
     motions = {ends: replace(step, length_ratio=None) for ends, step in motions.items()}
-    return gather_evidence(links, motions, {}, np.full(len(metres) + 1, 10.0))
+    return gather_evidence(links, motions, {}, 10.0)
 
 
 def test_a_step_of_half_a_metre_between_metres_is_an_outlier() -> None:

@@ -35,9 +35,8 @@ class Drive(RecordedSequence):
 
     def __init__(self, route: str, frames: int, seed: int) -> None:
         street = SimulatedStreet(SimulationOptions(route, 2 * frames, seed, *SIZE))
-        # image and depth of a frame come from one rendering
-        self.render = functools.lru_cache(2)(lambda index: street.render(2 * index))
-        images = ReadImages(*SIZE, frames, lambda index: self.render(index).image)
+        self.depth = lambda index: street.depth(2 * index)
+        images = ReadImages(*SIZE, frames, lambda index: street.render(2 * index))
         focal_and_centre = street.K[[0, 1, 0, 1], [0, 1, 2, 2]]
         stamps, height_m = 0.2 * np.arange(frames), street.camera_height_m
         poses = street.T_world_camera[::2]
@@ -56,7 +55,7 @@ def run(sequence: Drive) -> Estimate:
     """With a view for loops at every second frame, for this drive is short."""
 
     def depth_of(index: int) -> FloatArray:
-        depth = sequence.render(index).depth.astype(np.float64)
+        depth = sequence.depth(index).astype(np.float64)
         return np.where(depth > 0, depth, 200.0)
 
     oracle = OraclePredictor(sequence.reference, depth_of, NOISE, FACTOR)

@@ -16,9 +16,8 @@ def test_features_are_spread_and_bounded() -> None:
     street = SimulatedStreet(SimulationOptions("straight", 20, 621, *SIZE))
     intrinsics = Intrinsics(*SIZE, *street.K[[0, 1, 0, 1], [0, 1, 2, 2]])
     extractor = FeatureExtractor(intrinsics)
-    rendered = street.render(6)
-    depth, height_m = rendered.depth, street.camera_height_m
-    view = extractor.view(Frame(3, 0.6, rendered.image), depth, height_unscaled=height_m)
+    image, depth, height_m = street.render(6), street.depth(6), street.camera_height_m
+    view = extractor.view(Frame(3, 0.6, image), depth, height_unscaled=height_m)
     assert 100 < len(view) <= 500 and view.descriptors.shape == (len(view), 32)
     known = np.isfinite(view.points).all(axis=1)
     assert known.any() and view.points[known, 2].max() < 30 * height_m
@@ -27,7 +26,7 @@ def test_features_are_spread_and_bounded() -> None:
     assert view.pixels[:, 0].std() > 0.15 * SIZE[0]
     fixed = np.zeros((24, 78), bool)
     fixed[:, 39:] = True
-    seen = extractor.view(Frame(3, 0.6, rendered.image, fixed), depth, height_m)
+    seen = extractor.view(Frame(3, 0.6, image, fixed), depth, height_m)
     assert len(seen) > 100 and seen.pixels[:, 0].max() < SIZE[0] / 2
     blank = extractor.view(Frame(4, 0.4, np.full((SIZE[1], SIZE[0], 3), 90, np.uint8)), depth)
     assert len(blank) == 0

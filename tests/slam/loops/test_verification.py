@@ -79,20 +79,16 @@ def test_sigmas_grow_with_the_error_of_corners_and_cover_it(
 ) -> None:
     monkeypatch.setattr(verification, "_LENGTH_RELATIVE_SIGMA", 1e-6)
     whitened, sizes = [], []
+    T_a_b = from_rotation_vector(np.array([0.0, 0.05, 0.0]), np.array([0.5, 0.0, 0.0]))
     for sigma_px in (0.3, 1.0):
         for seed in range(12):
-            views = Scene(
-                from_rotation_vector(np.array([0.0, 0.05, 0.0]), np.array([0.5, 0.0, 0.0]))
-            ).views()
+            views = Scene(T_a_b).views()
             rng = np.random.default_rng(seed)
             for view in views:
                 view.pixels[:] += rng.normal(size=view.pixels.shape) * sigma_px
             loop = verify(*views)
             assert isinstance(loop, Loop)
-            T_error = invert(
-                from_rotation_vector(np.array([0.0, 0.05, 0.0]), np.array([0.5, 0.0, 0.0]))
-            )
-            T_error = T_error @ loop.measured.T_from_to
+            T_error = invert(T_a_b) @ loop.measured.T_from_to
             vee = [T_error[2, 1], T_error[0, 2], T_error[1, 0], *T_error[:3, 3]]
             whitened.append(np.array(vee) / loop.measured.sigmas)
             sizes.append(loop.measured.sigmas[0])

@@ -78,10 +78,10 @@ def street() -> tuple[Ply, FloatArray]:
 
 def test_the_ground_follows_slope_and_bank(street: tuple[Ply, FloatArray]) -> None:
     mesh, poses = street
-    ground = ground_along(mesh.points, poses, 1.5)
+    ground_at = ground_along(mesh.points, poses, 1.5)
     x, y = (each.ravel() for each in np.meshgrid([-6.0, 0.0, 6.0], [2.0, 10.0, 30.0, 50.0]))
-    np.testing.assert_allclose(ground.heights(np.stack([x, y], axis=1)), road(x, y), atol=0.12)
-    assert np.isnan(ground.heights(np.array([[40.0, 10.0]]))).all()
+    np.testing.assert_allclose(ground_at(np.stack([x, y], axis=1)), road(x, y), atol=0.12)
+    assert np.isnan(ground_at(np.array([[40.0, 10.0]]))).all()
 
 
 @pytest.mark.parametrize(("resolution", "unit"), [(0.1, 1.0), (0.25, 1 / CAMERA_HEIGHT)])

@@ -52,7 +52,6 @@ def repeated_as_jpeg(sequence: SimulatedSequence, index: int) -> Frame:
         ".jpg", sequence.frame(BAD[0] - 1).image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality]
     )
     decoded = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
-    assert decoded is not None
     return Frame(index, float(sequence.stamps[index]), np.ascontiguousarray(decoded[..., ::-1]))
 
 
@@ -113,7 +112,7 @@ def close_corners() -> Iterator[None]:
 
 def oracle_of(sequence: Damaged, rows: Sequence[int] = range(FRAMES)) -> OraclePredictor:
     def depth_of(index: int) -> np.ndarray:
-        depth = street().street.render(rows[index]).depth
+        depth = street().street.depth(rows[index])
         return np.where(depth > 0, depth, 200.0)
 
     return OraclePredictor(
@@ -183,11 +182,6 @@ def test_ten_frames_are_interpolated_and_reported(damage: Damage) -> None:
         k.index for k in seen.keyframes
     } & set(BAD)
     assert not {view.index for view in seen.views} & set(BAD)
-
-
-@pytest.mark.slow
-def test_frozen_frames_cost_no_more_than_black_ones() -> None:
-    assert ate(run_on(repeated_as_jpeg)[0]) < 2 * ate(run_on(black)[0])
 
 
 def test_no_road_is_measured_in_the_sky() -> None:
@@ -337,14 +331,12 @@ def test_a_camera_that_moves_too_little_to_be_told_from_the_frame_before_does_no
 
     monkeypatch.setattr(street_world, "plan_route", crawling)
     sequence = SimulatedSequence(SimulationOptions("straight", 2 * FRAMES, 3, 416, 128))
-    render = functools.lru_cache(2 * FRAMES)(sequence.street.render)
+    remembered = functools.lru_cache(2 * FRAMES)
+    render, depth = remembered(sequence.street.render), remembered(sequence.street.depth)
     monkeypatch.setattr(sequence.street, "render", render)
     noise = OracleNoise(np.deg2rad(0.1), 0.03, seed=2)
     predictor = OraclePredictor(
-        sequence.reference,
-        lambda k: np.where(render(k).depth > 0, render(k).depth, 200.0),
-        noise,
-        FACTOR,
+        sequence.reference, lambda k: np.where(depth(k) > 0, depth(k), 200.0), noise, FACTOR
     )
     config = config_with("mapping.enabled=false")
     result = SlamPipeline(sequence, predictor, config).run()
@@ -374,7 +366,7 @@ def test_the_threads_of_an_observer_end_with_it() -> None:
     assert set(threading.enumerate()) <= before
 
 
-def test_a_given_mask_joins_what_is_found() -> None:
+def test_a_given_mask_holds_until_one_is_found() -> None:
     sequence = street()
     given, found = np.zeros(sequence.frame(0).grey.shape, bool), np.zeros((2, 4), bool)
     given[-4:], found[:, 0] = True, True
@@ -383,6 +375,4 @@ def test_a_given_mask_joins_what_is_found() -> None:
         assert observer.measured.fixed is given
         observer.fixed.mask = found
         observer.add(1, replace(sequence.frame(1), fixed=given))
-        fixed = observer.finish().fixed
-    assert fixed is not None and fixed[-4:].all() and fixed[:, : given.shape[1] // 4].all()
-    assert not fixed[:-4, given.shape[1] // 4 :].any()
+        assert observer.finish().fixed is found

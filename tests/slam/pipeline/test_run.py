@@ -33,7 +33,6 @@ from slam.mapping.submap import Fusion
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline
 from slam.runtime.errors import ConfigError, Failed, SlamError
-from slam.sequences.recording import RecordedSequence
 from slam.simulation.options import SimulationOptions
 from slam.simulation.recording import SimulatedSequence
 
@@ -45,13 +44,7 @@ NO_IMAGES = ("visual_odometry.enabled=false", "mapping.enabled=false", "gaps.ena
 STREET = 25
 GPS_FRAMES = 200
 PLACE = np.array([49.0110, 8.4160, 115.0])
-SETTINGS = [
-    "visual_odometry.enabled=false",
-    "mapping.enabled=false",
-    "gaps.enabled=false",
-    "loops.enabled=false",
-    "keyframes.use=never",
-]
+WITHOUT_LOOPS = ("loops.enabled=false", "keyframes.use=never")
 # the first camera looks east: its x axis points south, its y axis down
 T_ENU_WORLD = se3.make(
     np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([5.0, -3.0, 1.0])
@@ -119,7 +112,6 @@ def road(index: int) -> FloatArray:
 def run(
     drive: LevelRoad, *overrides: str, noise: OracleNoise = NO_NOISE, depth_of=road
 ) -> Estimate:
-    assert drive.reference is not None
     oracle = OraclePredictor(drive.reference, depth_of, noise, FACTOR)
     return SlamPipeline(drive, oracle, load_config(None, [*NO_IMAGES, *overrides])).run()
 
@@ -158,7 +150,6 @@ class OneBadSnippet(OraclePredictor):
 
 def test_a_pose_that_is_no_number_costs_a_gap() -> None:
     drive = LevelRoad(turning(60))
-    assert drive.reference is not None
     oracle = OneBadSnippet(drive.reference, road, NO_NOISE, FACTOR)
     result = SlamPipeline(drive, oracle, load_config(None, NO_IMAGES)).run()
     assert [snippet.target for snippet in result.drive.trusted] == [*range(2, 20), *range(21, 58)]
@@ -177,7 +168,6 @@ def test_an_error_in_loops_or_graph_costs_these(
             kept.append((name, len(trajectory)))
 
     drive, kept = LevelRoad(turning(30)), []
-    assert drive.reference is not None
     pipeline = SlamPipeline(
         drive, OraclePredictor(drive.reference, road), load_config(None, NO_IMAGES)
     )
@@ -371,7 +361,6 @@ def test_two_runs_write_the_same_bytes(
             write_kitti(folder / f"{stem}.kitti.txt", getattr(result, stem))
             write_tum(folder / f"{stem}.tum.txt", getattr(result, stem))
         result.graph.write_g2o(folder / "graph.g2o")
-        assert result.map is not None
         result.map.surface().write_mesh(folder / "mesh.ply")
         result.map.surface().write_cloud(folder / "cloud.ply")
     for path in sorted((tmp_path / "first").iterdir()):
@@ -405,7 +394,6 @@ def test_without_metres_the_map_is_as_fine_as_the_scene_is_near(street: Simulate
     result = drive_street(street, mode="none", sky=np.nan)
     depths = [street.true_depth(k) for k in range(0, STREET, 6)]
     nearness = np.median([np.median(depth[depth > 0]) for depth in depths]) / street.camera_height_m
-    assert result.map is not None
     assert result.map.voxel_size == pytest.approx(0.2 * nearness / 15.0, rel=0.15)
     assert result.map.statistics()["triangles"] > 5000
 
@@ -422,16 +410,6 @@ def test_depth_is_thinned_for_the_map(
     ].depth_unscaled.shape == (32, 104)
 
 
-class Grey:
-    width, height = 104, 32
-
-    def __len__(self) -> int:
-        return GPS_FRAMES
-
-    def read(self, index: int) -> Image:
-        return np.full((32, 104, 3), 90, np.uint8)
-
-
 def path() -> FloatArray:
     k = np.arange(GPS_FRAMES - 1)
     yaw = 0.03 * np.sin(k / 19.0)
@@ -440,15 +418,6 @@ def path() -> FloatArray:
             np.stack([0 * yaw, yaw, 0 * yaw], 1), np.tile([0.0, 0.0, 1.0], (len(k), 1))
         )
     )
-
-
-def gps_drive() -> RecordedSequence:
-    return RecordedSequence("drive", Grey(), CAMERA, 0.1 * np.arange(GPS_FRAMES), (), path())
-
-
-def depth(index: int) -> FloatArray:
-    rows = np.minimum(1.5 * CAMERA.fy / np.maximum(np.arange(32) - CAMERA.cy, 1e-3), 30.0)
-    return np.repeat(rows[:, None], 104, axis=1)
 
 
 def track(rng: np.random.Generator, sigma_m: float, outliers: int = 0) -> GpsTrack:
@@ -465,11 +434,12 @@ def track(rng: np.random.Generator, sigma_m: float, outliers: int = 0) -> GpsTra
     )
 
 
-def located(gps: GpsTrack | None, *overrides: str, noise: OracleNoise | None = None) -> Estimate:
-    oracle = OraclePredictor(path(), depth, noise or OracleNoise(), 0.2)
-    return SlamPipeline(
-        gps_drive(), oracle, load_config(None, [*SETTINGS, *overrides]), gps_track=gps
-    ).run()
+def located(gps: GpsTrack | None, *overrides: str, noise: OracleNoise = NO_NOISE) -> Estimate:
+    drive = LevelRoad(path())
+    drive.camera_height_m = None
+    config = load_config(None, [*NO_IMAGES, *WITHOUT_LOOPS, *overrides])
+    oracle = OraclePredictor(path(), road, noise, FACTOR)
+    return SlamPipeline(drive, oracle, config, gps_track=gps).run()
 
 
 def worst(result: Estimate) -> float:

@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 import onnx
 import pytest
-import yaml
 from onnx import TensorProto, helper
 
 import slam.commands.cli
@@ -50,7 +49,6 @@ TRAJECTORY_ALONE = ["output.report=false", "mapping.enabled=false"]
 PLAIN: dict[str, Any] = {"kind": "depth", "mean": (0.0, 0.0, 0.0), "std": (1.0, 1.0, 1.0)}
 CheckRun = Callable[[Path], dict[str, Any]]
 FRAMES = 18
-COARSE_MAP = ["mapping.enabled=true", "mapping.voxel_size_m=0.5", "depth.refine=none"]
 
 
 def frames(first: int = 0, count: int = 5) -> list[Frame]:
@@ -155,10 +153,6 @@ def test_depth_of_any_size_is_resized_and_unknown_pixels_do_not_spread(
     assert np.isnan(half[:, : WIDTH // 2 - 6]).all() and half.dtype == np.float32
 
 
-def frame(index: int) -> Frame:
-    return Frame(index, 0.1 * index, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
-
-
 def folder_of(path: Path, names: list[str]) -> Path:
     """Frame k is k + 1 metres away."""
     path.mkdir(exist_ok=True)
@@ -167,13 +161,12 @@ def folder_of(path: Path, names: list[str]) -> Path:
     return path
 
 
-def opened(folder: Path, numbers: FrameNumbers, kind: str = "npy", **settings: Any) -> DepthFolder:
-    return DepthFolder(DepthConfig(source=f"{kind}:{folder}", **settings), numbers, WIDTH, HEIGHT)
+def opened(folder: Path, numbers: FrameNumbers, files: str = "npy", **settings: Any) -> DepthFolder:
+    return DepthFolder(DepthConfig(source=f"{files}:{folder}", **settings), numbers, WIDTH, HEIGHT)
 
 
 def metres(source: DepthFolder, index: int) -> float:
-    disparity = source.disparity(frame(index))
-    assert disparity is not None
+    disparity = source.disparity(*frames(index, 1))
     return float(1 / disparity[0, 0])
 
 
@@ -199,7 +192,7 @@ def test_a_missing_number_is_an_error_only_if_its_frame_is_there(tmp_path: Path)
     source = opened(folder, FrameNumbers(8, 0, 8))
     assert metres(source, 4) == pytest.approx(5)
     with pytest.raises(SlamError, match="no depth for frame 3"):
-        source.disparity(frame(3))
+        source.disparity(*frames(3, 1))
 
 
 @pytest.mark.parametrize(("scale", "value"), [(256.0, 10.0), (1000.0, 2.56)])
@@ -209,26 +202,17 @@ def test_pictures_of_16_bits_have_a_scale_and_zero_is_unknown(
     picture = np.full((HEIGHT, WIDTH), 2560, np.uint16)
     picture[0, 0] = 0
     cv2.imwrite(str(tmp_path / "000000.png"), picture)
-    disparity = opened(tmp_path, FrameNumbers(1, 0, 1), "png", png_scale=scale).disparity(frame(0))
-    assert (
-        disparity is not None
-        and np.isnan(disparity[0, 0])
-        and disparity[5, 5] == pytest.approx(1 / value)
+    disparity = opened(tmp_path, FrameNumbers(1, 0, 1), "png", png_scale=scale).disparity(
+        *frames(0, 1)
     )
+    assert np.isnan(disparity[0, 0]) and disparity[5, 5] == pytest.approx(1 / value)
 
 
 def test_disparity_may_be_given_and_axes_of_length_one_do_not_matter(tmp_path: Path) -> None:
     np.save(tmp_path / "0.npy", np.full((1, HEIGHT, WIDTH, 1), 0.125, np.float16))
-    source = DepthFolder(
-        DepthConfig(source=f"npy:{tmp_path}", kind="disparity"),
-        FrameNumbers(1, 0, 1),
-        WIDTH,
-        HEIGHT,
-    )
-    disparity = source.disparity(frame(0))
-    assert (
-        disparity is not None and disparity.shape == (HEIGHT, WIDTH) and (disparity == 0.125).all()
-    )
+    source = opened(tmp_path, FrameNumbers(1, 0, 1), kind="disparity")
+    disparity = source.disparity(*frames(0, 1))
+    assert disparity.shape == (HEIGHT, WIDTH) and (disparity == 0.125).all()
 
 
 def test_the_digest_is_of_names_and_content(tmp_path: Path) -> None:
@@ -395,7 +379,6 @@ def exported(tiny_weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 def positions(run: RunFolder, name: str = "optimised") -> np.ndarray:
     trajectory = run.trajectory(name)
-    assert trajectory is not None
     return trajectory.positions
 
 
@@ -441,17 +424,6 @@ def test_exact_depth_gives_a_run_of_the_right_scale_in_any_unit(
     assert place.T_world_camera is None or place.nearest_frame is not None
 
 
-@pytest.mark.slow
-def test_exact_depth_gives_a_map_and_a_report_that_names_it(
-    world: Path, tmp_path: Path, check_run: CheckRun
-) -> None:
-    pictures = run(
-        world, tmp_path / "png", f"png:{exact(world)}", *COARSE_MAP, "output.report=true"
-    )
-    assert check_run(pictures.path)["map"]["triangles"] > 0
-    assert f"png:{exact(world)}" in (pictures.path / "report.html").read_text()
-
-
 def test_a_range_of_frames_and_a_blank_one(
     world: Path, arrays: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -464,19 +436,12 @@ def test_a_range_of_frames_and_a_blank_one(
 
 def test_depth_of_distorted_images_is_undistorted_with_them(world: Path, tmp_path: Path) -> None:
     depth, camera = exact(world) / "000000.png", tmp_path / "camera.yaml"
-    lens: dict[str, Any] = {
-        "width": 312,
-        "height": 96,
-        "fx": 180,
-        "fy": 180,
-        "cx": 155,
-        "cy": 45,
-        "fps": 10,
-    }
-    camera.write_text(yaml.safe_dump(lens | {"model": "opencv", "distortion": [-0.2, 0.03, 0, 0]}))
+    camera.write_text(
+        "width: 312\nheight: 96\nfx: 180\nfy: 180\ncx: 155\ncy: 45\nfps: 10\n"
+        "model: opencv\ndistortion: [-0.2, 0.03, 0, 0]\n"
+    )
     recording = open_sequence(world, "sim", camera)
     pinhole, lens = recording.intrinsics, recording.undistortion
-    assert lens is not None
     K, coefficients = (
         np.array([[180, 0, 155], [0, 180, 45], [0, 0, 1.0]]),
         np.array([-0.2, 0.03, 0, 0]),

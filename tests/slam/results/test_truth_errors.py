@@ -61,7 +61,6 @@ def errors(
 ) -> dict[str, Any]:
     """Errors of a map in the world of the true poses, all lengths divided by ``scale``."""
     unit: LengthUnit = "camera heights" if mode == "none" else "metres"
-    assert sequence.reference is not None
     T_world_camera = sequence.reference.copy()
     T_world_camera[:, :3, 3] /= scale
     result = SimpleNamespace(
@@ -117,7 +116,6 @@ def test_an_excerpt_has_the_truth_of_its_own_frames(
         camera = sequence.intrinsics
         depth = embedded.true_depth(9)
         seen = (camera.rays(camera.pixel_grid()) * depth[..., None])[(depth > 0) & (depth < 15)]
-        assert sequence.reference is not None
         found = errors(apply(sequence.reference[5], seen), sequence)
         assert found["accuracy_median_m"] < 0.03
 

@@ -34,9 +34,9 @@ def test_several_sequences_are_listed(tmp_path: Path, odometry) -> None:
     with pytest.raises(
         SequenceError, match="has 3 sequences: 00, 02, 10; choose one with --sequence"
     ):
-        open_sequence(tmp_path, None, None, None)
+        open_sequence(tmp_path)
     with pytest.raises(SequenceError) as caught:
-        open_sequence(tmp_path, "09", None, None)
+        open_sequence(tmp_path, "09")
     assert str(caught.value) == (
         f"no sequence 09 in {tmp_path}: found 00, 02, 10 under {tmp_path / 'sequences'}; "
         "choose one of them with --sequence"
@@ -49,16 +49,16 @@ def test_sequence_without_images_says_so(tmp_path: Path, odometry) -> None:
     (tmp_path / "sequences/09/calib.txt").write_text("")
     assert list(sequence_kinds(tmp_path)) == ["00"]
     with pytest.raises(SequenceError, match=r"no images in .*09: looked for .*image_2"):
-        open_sequence(tmp_path, "09", None, None)
+        open_sequence(tmp_path, "09")
 
 
 def test_name_of_a_folder_inside(tmp_path: Path, images, camera_yaml: str) -> None:
     images(tmp_path / "mine", ["0.png", "1.png"])
     (tmp_path / "mine" / "camera.yaml").write_text(camera_yaml)
-    assert open_sequence(tmp_path, "mine", None, None).name == "mine"
-    assert open_sequence(tmp_path / "mine", "mine", None, None).name == "mine"
+    assert open_sequence(tmp_path, "mine").name == "mine"
+    assert open_sequence(tmp_path / "mine", "mine").name == "mine"
     with pytest.raises(SequenceError, match=r"no sequence yours in .*found mine"):
-        open_sequence(tmp_path / "mine", "yours", None, None)
+        open_sequence(tmp_path / "mine", "yours")
 
 
 def test_the_door_is_light() -> None:
@@ -181,7 +181,7 @@ def test_namings_of_pieces(trip: Path, names: tuple[str, ...]) -> None:
 def test_opens(
     data_root: Path, path: str, name: str | None, frames: int, length_m: float | None, height_m
 ) -> None:
-    sequence = open_sequence(data_root / path, name, None, None)
+    sequence = open_sequence(data_root / path, name)
     assert len(sequence) == frames == len(sequence.stamps)
     K = sequence.intrinsics
     for index in (0, frames // 2, frames - 1):
@@ -203,7 +203,7 @@ def test_roots_list_their_sequences(data_root: Path) -> None:
 
 
 def test_raw_drive_goes_forward_and_smoothly(data_root: Path) -> None:
-    sequence = open_sequence(data_root / "kitti_raw", None, None, None)
+    sequence = open_sequence(data_root / "kitti_raw")
     assert (sequence.intrinsics.width, sequence.intrinsics.height) == (828, 250)
     assert sequence.intrinsics.fx == pytest.approx(721.5377 * 2 / 3)
     assert sequence.reference is not None and se3.is_se3(sequence.reference)
@@ -217,7 +217,7 @@ def test_raw_drive_goes_forward_and_smoothly(data_root: Path) -> None:
 
 def test_lidar_lands_on_the_image(data_root: Path) -> None:
     """Road points in front of the car project below the horizon, at the camera's height."""
-    sequence = open_sequence(data_root / "kitti_raw", None, None, None)
+    sequence = open_sequence(data_root / "kitti_raw")
     assert sequence.T_camera_lidar is not None
     points = se3.apply(sequence.T_camera_lidar, sequence.scan(0))
     road = points[(np.abs(points[:, 0]) < 2) & (points[:, 2] > 6) & (points[:, 2] < 12)]

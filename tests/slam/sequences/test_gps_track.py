@@ -10,12 +10,6 @@ import pytest
 from slam.runtime.errors import SequenceError
 from slam.sequences.gps_track import read_gps
 
-NMEA = """$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47
-$GPRMC,123519,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W*6A
-$GPGGA,123520,4807.050,S,01131.000,W,0,00,,,M,,M,,
-$GPGGA,123521,4807.050,S,01131.000,W,1,08,1.8,545.0,M,46.9,M,,
-"""
-
 
 def written(folder: Path, text: str) -> Path:
     path = folder / "track"
@@ -31,25 +25,15 @@ def test_csv(tmp_path: Path) -> None:
     np.testing.assert_array_equal(track.dilution, 1.0)
 
 
-def test_nmea_without_fixes_that_are_none(tmp_path: Path) -> None:
-    track = read_gps(written(tmp_path, NMEA))
-    np.testing.assert_allclose(track.stamps, [45319.0, 45321.0])  # 12:35:19
-    np.testing.assert_allclose(track.places[0], [48.1173, 11.516667, 545.4], atol=1e-6)
-    np.testing.assert_allclose(track.places[1, :2], [-48.1175, -11.516667], atol=1e-6)
-    np.testing.assert_array_equal(track.dilution, [0.9, 1.8])
-
-
-def test_nmea_around_midnight_and_without_an_altitude(tmp_path: Path) -> None:
-    fix = "$GPGGA,{},4807.038,N,01131.000,E,1,08,0.9,{},M,46.9,M,,\n"
-    text = fix.format("235958", 545.4) + fix.format("235959", "") + fix.format("000001", 545.4)
-    np.testing.assert_array_equal(read_gps(written(tmp_path, text)).stamps, [86398.0, 86401.0])
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         ("time,lat\n1,2\n", "lacks longitude: its first row"),
-        ("<?xml version='1.0'?><gpx></gpx>", "XML, such as GPX, which is not read"),
+        ("<?xml version='1.0'?><gpx></gpx>", "XML, such as GPX, or NMEA, which are not read"),
+        (
+            "$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\n",
+            "convert it to CSV",
+        ),
         ("t,lat,lon,speed\n0,49,8,46\n1,49.00012,8,46\n2,49.00024,8,46\n", "speed_kmh"),
         ("stamp,latitude,longitude,altitude\n", "holds no GPS fix"),
         ("stamp,latitude,longitude,altitude\n0,95,8,100\n", "line 2: no GPS fix"),
@@ -59,7 +43,6 @@ def test_nmea_around_midnight_and_without_an_altitude(tmp_path: Path) -> None:
             "stamp,latitude,longitude,altitude\n1,49,8,100\n2,50,8,100\n3,51,8,100\n",
             "fixes move at 11119[45] m/s",
         ),
-        ("$GPGGA,123519,48x07.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,", "line 1: no GPS fix"),
     ],
 )
 def test_what_is_no_track(tmp_path: Path, text: str, said: str) -> None:

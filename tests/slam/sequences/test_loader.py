@@ -42,7 +42,7 @@ def test_layouts(
     images(folder / inner, [f"f{k}{suffix}" for k in range(12)])
     ((tmp_path if beside else folder) / "camera.yaml").write_text(camera_yaml)
     (folder / "ins.txt").write_text("ignored")
-    sequence = open_sequence(folder, None, None, None)
+    sequence = open_sequence(folder)
     assert (sequence.name, len(sequence)) == ("drive", 12)
     assert sequence.frame(11).image[0, 0, 0] == pytest.approx(110, abs=2)
     assert sequence.stamps == pytest.approx(np.arange(12) / 5)
@@ -63,7 +63,7 @@ def test_undistorts(tmp_path: Path, images, camera_yaml: str) -> None:
     (tmp_path / "camera.yaml").write_text(
         camera_yaml + "model: opencv\ndistortion: [-0.2, 0, 0, 0]\n"
     )
-    sequence = open_sequence(tmp_path, None, None, None)
+    sequence = open_sequence(tmp_path)
     assert sequence.intrinsics.fx < 30 and (sequence.frame(1).image == 10).all()
 
 

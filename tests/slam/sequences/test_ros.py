@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 import struct
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,7 +14,6 @@ import numpy as np
 import pytest
 from bags import BagWriter
 
-from erfsfm.common.readers.camera_file import CameraFile, Pinhole, read_camera_file
 from slam.commands.doctor import examine
 from slam.frames import Intrinsics
 from slam.runtime import imports
@@ -36,7 +33,6 @@ CHANNELS = {
     "16UC1": 1,
 }
 COMPARED_FRAMES, COMPARED_STEP_NS = 8, 100_000_000
-BENT = (-0.02, 0.001, 0.0, 0.0)
 
 
 def picture(k: int, channels: int = 1) -> np.ndarray:
@@ -221,7 +217,6 @@ def test_true_poses_and_scans_come_with_their_static_transforms(new_bag: NewBag,
         )
         bag.write("/points", FIRST_NS + 3 * STEP_NS + late_ns, cloud)
     sequence = open_sequence(bag.close())
-    assert sequence.reference is not None
     assert sequence.reference[:, :3, 3] == pytest.approx(
         np.outer(np.arange(FRAMES), [0, 0, 1]), abs=1e-9
     )
@@ -356,74 +351,6 @@ def test_without_rosbags_the_extra_is_named(
     monkeypatch.setattr(imports.importlib, "import_module", absent)
     with pytest.raises(SlamError, match=r"bags need rosbags .*erfsfm-slam\[ros\]"):
         open_sequence(tmp_path / "walk.bag")
-
-
-def write_plain(folder: Path, files: list[Path], stamps: list[int], camera: CameraFile) -> Path:
-    folder.mkdir()
-    for path in files:
-        shutil.copy(path, folder)
-    (folder / "times.txt").write_text("".join(f"{s // 10**9}.{s % 10**9:09d}\n" for s in stamps))
-    (folder / "camera.yaml").write_text(json.dumps(camera.model_dump(exclude_none=True)))
-    return folder
-
-
-def write_euroc(folder: Path, files: list[Path], stamps: list[int], camera: CameraFile) -> Path:
-    data = folder / "mav0/cam0/data"
-    data.mkdir(parents=True)
-    for path, stamp in zip(files, stamps, strict=True):
-        shutil.copy(path, data / f"{stamp}.png")
-    (data.parent / "data.csv").write_text(
-        "#timestamp,filename\n" + "".join(f"{s},{s}.png\n" for s in stamps)
-    )
-    sensor = {
-        "T_BS": {"data": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]},
-        "rate_hz": 10,
-        "resolution": [camera.width, camera.height],
-        "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
-        "distortion_model": "radtan",
-        "distortion_coefficients": list(BENT),
-    }
-    (data.parent / "sensor.yaml").write_text("%YAML:1.0\n" + json.dumps(sensor))
-    return folder
-
-
-def write_bag(
-    bag: Any, files: list[Path], stamps: list[int], camera: CameraFile, lens: str = "plumb_bob"
-) -> Path:
-    bag.camera_info("/camera/camera_info", camera.pinhole, lens, BENT)
-    for path, stamp in zip(files, stamps, strict=True):
-        bag.image("/camera/image_raw", stamp, cv2.imread(str(path)), "bgr8", late_ns=3_000_000)
-    made: Path = bag.close()
-    return made
-
-
-def test_the_same_frames_are_the_same_sequence(
-    tmp_path: Path, kitti_root: Path, new_bag: Callable[..., Any]
-) -> None:
-    files = sorted((kitti_root / "sequences/sim/image_2").iterdir())[:COMPARED_FRAMES]
-    stamps = [FIRST_NS + k * COMPARED_STEP_NS for k in range(COMPARED_FRAMES)]
-    simulated = open_sequence(kitti_root).intrinsics
-    known = read_camera_file(kitti_root / "camera.yaml").model_dump() | vars(Pinhole.of(simulated))
-    camera = CameraFile.model_validate(
-        known | {"model": "opencv", "distortion": BENT, "camera_height_m": "unknown"}
-    )
-    plain, *others = map(
-        open_sequence,
-        (
-            write_plain(tmp_path / "plain", files, stamps, camera),
-            write_euroc(tmp_path / "euroc", files, stamps, camera),
-            write_bag(new_bag("ros1", "one"), files, stamps, camera),
-            write_bag(new_bag("sqlite", "two"), files, stamps, camera, lens=""),
-        ),
-    )
-    assert plain.intrinsics.undistorted and plain.stamps[0] == pytest.approx(
-        FIRST_NS / 1e9, abs=1e-6
-    )
-    for other in others:
-        assert other.intrinsics == plain.intrinsics and other.camera_height_m is None
-        np.testing.assert_array_equal(other.stamps, plain.stamps)
-        for k in range(COMPARED_FRAMES):
-            np.testing.assert_array_equal(other.frame(k).image, plain.frame(k).image)
 
 
 @pytest.fixture(params=["ros1", "mcap", pytest.param("sqlite", marks=pytest.mark.slow)])

@@ -23,13 +23,12 @@ def test_kitti_root_holds_what_was_rendered(tmp_path: Path) -> None:
         "sequences",
         "simulation.json",
     ]
-    sequence, frame = root / "sequences" / "sim", street.render(2)
-    assert np.array_equal(
-        cv2.imread(str(sequence / "image_2" / "000002.png"))[..., ::-1], frame.image
-    )
+    sequence, depth = root / "sequences" / "sim", street.depth(2)
+    image = cv2.imread(str(sequence / "image_2" / "000002.png"))[..., ::-1]
+    assert np.array_equal(image, street.render(2))
     encoded = cv2.imread(str(sequence / "depth_2" / "000002.png"), cv2.IMREAD_UNCHANGED)
-    assert encoded.dtype == np.uint16 and ((encoded == 0) == (frame.depth == 0)).all()
-    assert np.abs(encoded / 256.0 - frame.depth).max() <= 0.5 / 256 + 1e-6
+    assert encoded.dtype == np.uint16 and ((encoded == 0) == (depth == 0)).all()
+    assert np.abs(encoded / 256.0 - depth).max() <= 0.5 / 256 + 1e-6
     scan = np.fromfile(sequence / "velodyne" / "000001.bin", np.float32).reshape(-1, 4)
     assert np.array_equal(scan, street.scan(1))
     assert np.loadtxt(sequence / "times.txt") == pytest.approx([0.0, 0.1, 0.2])

@@ -3,7 +3,8 @@ import pytest
 
 from slam.frames import Intrinsics
 from slam.geometry import se3
-from slam.simulation.geometry import FLAT, Material, Soup
+from slam.simulation.geometry import FLAT
+from slam.simulation.shapes import Site
 from slam.simulation.world import Surface, place_rays
 
 CAMERA = Intrinsics(64, 32, 100.0, 50.0, 31.5, 15.5)
@@ -15,9 +16,9 @@ T_SCENE_CAMERA = se3.make(
 
 @pytest.mark.parametrize("slope", [0.0, 0.1, -0.1])
 def test_depth_of_a_slope_is_that_of_hand(slope: float) -> None:
-    soup = Soup(np.random.default_rng(0))
-    ground = soup.instance(Material.ASPHALT, np.full(3, 0.3))
-    soup.quad(
+    site = Site(np.random.default_rng(0))
+    ground = site.instance("asphalt", np.full(3, 0.3))
+    site.quad(
         np.array([0.0, -500.0, 0.0]),
         np.array([900.0, 0.0, 900.0 * slope]),
         np.array([0.0, 1000.0, 0.0]),
@@ -26,7 +27,7 @@ def test_depth_of_a_slope_is_that_of_hand(slope: float) -> None:
     rays = place_rays(
         T_SCENE_CAMERA, CAMERA.rays(CAMERA.pixel_grid()).reshape(-1, 3).astype(np.float32)
     )
-    depth = Surface(soup.finish(FLAT)).cast(rays)["t_hit"].reshape(32, 64)
+    depth = Surface(site.finish(FLAT)).cast(rays)["t_hit"].reshape(32, 64)
     row = np.arange(22, 32)
     expected = 1.5 / ((row - 15.5) / 50.0 + slope)  # 1.5 - depth (v - cy) / fy = slope depth
     np.testing.assert_allclose(

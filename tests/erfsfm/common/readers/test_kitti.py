@@ -27,7 +27,6 @@ def test_odometry_roots(tmp_path: Path, given: str) -> None:
         if camera:
             (sequences / name / camera / "000000.png").write_bytes(b"")
     root = find_odometry_root(tmp_path / given)
-    assert root is not None
     assert (root.base.name, root.names(), len(root.folders())) == ("dataset", ["2", "10"], 3)
     assert [odometry_camera(sequences / name) for name in ("10", "2", "00")] == [3, 0, None]
     assert root.recording_name("10") == "kitti_odometry/10"

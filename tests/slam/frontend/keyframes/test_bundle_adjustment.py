@@ -158,7 +158,6 @@ def test_the_sum_of_the_parts_is_solved(cameras: int) -> None:
         )
     side = np.random.default_rng(4).normal(size=(cameras, 6))
     found = solve_sum(parts, side)
-    assert found is not None
     np.testing.assert_allclose(S.reshape(6 * cameras, -1) @ found.ravel(), side.ravel(), atol=1e-8)
 
 

@@ -33,7 +33,6 @@ def test_another_length_keeps_rotation_and_direction() -> None:
     )
     np.testing.assert_array_equal(scaled.sigmas[:3], motion.relative_pose.sigmas[:3])
     assert 0.0299 <= scaled.sigmas[5] < 0.035
-    assert scaled.correlated_sigmas is not None
     np.testing.assert_array_equal(scaled.correlated_sigmas[:3], scaled.sigmas[:3])
     assert 0.0899 <= scaled.correlated_sigmas[5] < 0.095
     assert (scaled.ends, scaled.source) == ((4, 5), "essential")

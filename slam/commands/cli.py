@@ -489,7 +489,7 @@ def _print_run(folder: RunFolder) -> None:
     """The errors of a run, what raises doubt, and where everything is."""
     from slam.results.report.tables import by_reason
     from slam.results.tables import errors_table, motion_line, written
-    from slam.results.verdict import verdict
+    from slam.results.verdict import how_sure, verdict
     from slam.runtime.files import REPORT
 
     metrics = folder.metrics()
@@ -501,10 +501,9 @@ def _print_run(folder: RunFolder) -> None:
         errors_table(metrics.evaluated_errors(), title).print()
     if line := motion_line(metrics):
         typer.echo(f"estimated path: {line}")
-    if (sure := metrics.confidence.run) is not None:
-        typer.echo(
-            f"confidence {written(sure, 2)}: this share of drives like it err by at most 1 % of their path"
-        )
+    sure, words = how_sure(metrics)
+    if sure is not None:
+        typer.echo(f"confidence {written(sure, 2)}: this share of drives like it {words}")
     if (found := verdict(metrics)) is not None and found.doubts:
         typer.echo(f"doubts: {'; '.join(found.doubts)}")
     for note in metrics.unit_notes():

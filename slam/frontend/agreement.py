@@ -20,7 +20,7 @@ from slam.frontend.self_calibration import SURE, FoundCamera, check_camera
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.motion import Motion
 from slam.geometry.robust import mad_sigma
-from slam.geometry.se3 import FloatArray, invert, rotation_angle
+from slam.geometry.se3 import FloatArray, invert, path_distance, rotation_angle
 from slam.runtime.errors import Failed, SlamError
 
 logger = logging.getLogger(__name__)
@@ -40,11 +40,13 @@ _FAR_SPREAD = 0.18  # of the logarithm
 _FAR_CORNERS = 0.05  # least corners over the most of a distance
 _CONTRADICTED_SPREAD = 0.007
 _LEAST_MOVED = 0.1  # of long steps
+_LEAST_APART = 0.1  # between poses whose directions are compared: shorter steps are noise
 _ALONG = np.cos(np.deg2rad(20.0))  # of the directions of steps
 _ASIDE_SPREAD = 0.01
 _INTERPOLATED_SPREAD, _SEGMENT_SIGMAS = 0.03, 3.0
 # of `share_right`, by tools/fit_confidence.py of commit 669cc2b1
 CONFIDENCE = (0.97, 3.0, 5.5)
+SHAPE_WITHIN = 0.01, 0.03  # of the path, by a vehicle and by a carried camera
 # of a path along a road that is stretched, the error over the path and the stretch
 _STRETCHED = 0.29
 _CAPPED = 3.0  # sigmas of what leaves a confidence of less than a half
@@ -168,7 +170,11 @@ def of_positions(
 
 def of_directions(T_odometry: FloatArray) -> Agreement:
     """By poses ``(N, 4, 4)`` of a vehicle: it goes along one axis of its camera, forwards or backwards."""
-    steps = (invert(T_odometry[:-1]) @ T_odometry[1:])[:, :3, 3]
+    tenths = np.floor(path_distance(T_odometry) / _LEAST_APART)
+    is_apart = np.diff(tenths, prepend=-1.0) > 0
+    is_apart[-1] = True
+    apart = T_odometry[is_apart]
+    steps = (invert(apart[:-1]) @ apart[1:])[:, :3, 3]
     lengths = np.linalg.norm(steps, axis=1)
     moved = steps[lengths > _LEAST_MOVED * np.quantile(lengths, 0.9)]
     _, axes = np.linalg.eigh(moved.T @ moved)
@@ -283,9 +289,20 @@ def confidence(
         return Failed("it is calibrated on roads, not for a camera that is carried")
     if not is_metric:
         return Failed("it is calibrated for lengths in metres")
-    share = float(share_right(max((each.sigmas for each in agreements), default=0.0), CONFIDENCE))
+    share = shape_confidence(agreements)
     stretched = _STRETCHED * np.sqrt(2.0) * focal_sigma
     return min(share, float(erf(0.01 / stretched))) if stretched else share
+
+
+def shape_confidence(agreements: Iterable[Agreement], drift: float = 0.0) -> float:
+    """As `confidence`, of the shape alone: the error after one fitted scale is at most one of `SHAPE_WITHIN`.
+
+    Args:
+        agreements: of all sources.
+        drift: of a carried camera, sigma of its positions over the path: 1 % of it speaks as one sigma does.
+    """
+    largest = max((each.sigmas for each in agreements), default=0.0)
+    return float(share_right(max(largest, 100.0 * drift), CONFIDENCE))
 
 
 def share_right(sigmas: FloatArray | float, constants: tuple[float, float, float]) -> FloatArray:

@@ -26,11 +26,12 @@ from scipy.spatial.transform import Rotation
 
 from slam.formats.trajectory import translations_and_quaternions
 from slam.frames import LOOP_SOURCE, RelativePose
-from slam.geometry.se3 import FloatArray, invert, is_se3, make
+from slam.geometry.se3 import FloatArray, invert, is_se3, make, path_distance
 from slam.runtime.errors import SlamError
 from slam.runtime.files import write_atomically
 
 _ANCHOR_SIGMA = 1e-6
+_SPREAD_FRAMES = 8  # by which drift is judged
 # of the first pose where positions hold the graph: radians, metres
 _LOOSE_SIGMAS = np.repeat([0.3, 1e3], 3)
 # whitened residual at which the loss becomes linear: 95 % efficient for normal errors
@@ -180,8 +181,23 @@ class PoseGraph:
             raise SlamError(
                 f"no frame {frame} in the pose graph: it has 0 to {len(T_world_camera) - 1}"
             )
-        values = self._values(T_world_camera)
-        return np.asarray(gtsam.Marginals(self._factors(values), values).marginalCovariance(frame))
+        return np.asarray(self._marginals().marginalCovariance(frame))
+
+    def drift(self) -> float:
+        """Sigma of the positions over the path, root mean square of frames spread over it.
+
+        Raises:
+            SlamError: the graph was not optimised.
+        """
+        T_world_camera, marginals = self._solution(), self._marginals()
+        frames = np.linspace(0, len(T_world_camera) - 1, _SPREAD_FRAMES + 1).astype(int)[1:]
+        squared = [np.trace(marginals.marginalCovariance(k)[3:, 3:]) for k in frames.tolist()]
+        path = max(float(path_distance(T_world_camera)[-1]), _ANCHOR_SIGMA)
+        return float(np.sqrt(np.mean(squared))) / path
+
+    def _marginals(self) -> Any:
+        values = self._values(self._solution())
+        return gtsam.Marginals(self._factors(values), values)
 
     def write_g2o(self, path: Path) -> None:
         """Write the optimised graph in g2o's text format at full precision, atomically.

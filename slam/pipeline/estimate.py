@@ -47,7 +47,8 @@ class Estimate:
     ``drive`` is completed, its rotations smoothed; the points of ``views`` are in the unit of the trajectories.
     ``graph`` is the reason where it has no solution: the optimised trajectory then is the odometry.
     ``location`` is None without a GPS track, and the reason where the track cannot be used. ``agreements`` say how far
-    each optional source contradicts the images, ``confidence`` what follows from all of them, or why nothing does.
+    each optional source contradicts the images, ``confidence`` what follows from all of them, or why nothing does,
+    and ``shape`` what follows for the trajectory after one fitted scale.
     """
 
     network: Trajectory
@@ -64,6 +65,7 @@ class Estimate:
     location: Location | Failed | None
     stopwatch: Stopwatch
     confidence: float | Failed
+    shape: float | Failed
     agreements: Sequence[Agreement] = ()
     map: TsdfMap | None = None
 

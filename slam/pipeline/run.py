@@ -173,7 +173,9 @@ class SlamPipeline:
         if isinstance(solved, Failed):
             solved = solved, T_odometry, LoopClosures(not_sought=solved.reason), location
         graph, T_optimised, loops, location = solved
-        agreements, confidence = self._confidence(drive, scale, T_odometry, agreements)
+        agreements, confidence, shape = self._confidence(
+            drive, scale, T_odometry, agreements, graph
+        )
         return Estimate(
             network=network,
             odometry=self._trajectory(T_odometry),
@@ -190,6 +192,7 @@ class SlamPipeline:
             stopwatch=self._watch,
             agreements=agreements,
             confidence=confidence,
+            shape=shape,
         )
 
     def fuse(self, estimate: Estimate, recorder: Recorder) -> TsdfMap | None:
@@ -370,9 +373,14 @@ class SlamPipeline:
         return [] if worst is not None and worst.is_wrong else steps, compared
 
     def _confidence(
-        self, drive: Drive, scale: Scale, T_odometry: FloatArray, by_sources: Sequence[Agreement]
-    ) -> tuple[list[Agreement], float | Failed]:
-        """Agreements of all sources and of the images, and what follows from them."""
+        self,
+        drive: Drive,
+        scale: Scale,
+        T_odometry: FloatArray,
+        by_sources: Sequence[Agreement],
+        graph: PoseGraph | Failed,
+    ) -> tuple[list[Agreement], float | Failed, float | Failed]:
+        """Agreements of all sources and of the images, and what follows from them for the run and its shape."""
         by_sources, camera = list(by_sources), self.sequence.intrinsics
         if self._fixes is not None and (by_gps := self._fixes.agreement) is not None:
             # why it is not used was said
@@ -385,7 +393,11 @@ class SlamPipeline:
         sure = agreement.confidence(
             trusted, scale.is_metric, drive.by_keyframes, camera.focal_sigma
         )
-        return [*by_sources, *of_images], sure
+        drift: float | Failed = 0.0
+        if drive.by_keyframes:
+            drift = graph if isinstance(graph, Failed) else attempt("the drift", graph.drift)
+        shape = drift if isinstance(drift, Failed) else agreement.shape_confidence(trusted, drift)
+        return [*by_sources, *of_images], sure, shape
 
     @cached_property
     def _decide(self) -> Decide | None:

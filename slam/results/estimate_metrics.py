@@ -19,6 +19,7 @@ from slam.evaluation.trajectory import TrajectoryMetrics, trajectory_metrics
 from slam.formats.trajectory import Trajectory
 from slam.frames import RelativePose, runs
 from slam.frames import Sequence as FrameSequence
+from slam.frontend.agreement import SHAPE_WITHIN
 from slam.frontend.drive import DOUBLED
 from slam.frontend.gps import GpsFixes, Location
 from slam.frontend.lidar_odometry import LidarPath
@@ -61,7 +62,11 @@ def estimate_metrics(
         timing=timing_of(result.stopwatch, len(sequence)),
         scale=_scale(result),
         agreement=[records.AgreementMetrics(**asdict(each)) for each in result.agreements],
-        confidence=records.ConfidenceMetrics.of(run=result.confidence),
+        confidence=records.ConfidenceMetrics.of(
+            run=result.confidence,
+            shape=result.shape,
+            shape_within=SHAPE_WITHIN[result.drive.by_keyframes],
+        ),
         support=_BY_MAPS
         if (support := result.drive.support) is None
         else support.round(2).tolist(),

@@ -104,9 +104,14 @@ class AgreementMetrics(Record):
 
 
 class ConfidenceMetrics(Record):
-    """Share of drives of this kind that err by at most 1 % of their path."""
+    """Share of drives of this kind that err by at most 1 % of their path.
+
+    ``shape``: by at most the share ``shape_within`` of it after one fitted scale.
+    """
 
     run: float | None = None
+    shape: float | None = None
+    shape_within: float | None = None
 
 
 class Trajectories(Record):

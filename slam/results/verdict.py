@@ -51,6 +51,15 @@ def verdict(metrics: Metrics) -> Verdict | None:
     return Verdict(_sentence(metrics), signs, doubts, scraps)
 
 
+def how_sure(metrics: Metrics) -> tuple[float | None, str]:
+    """The confidence and what it is the share of: of the shape alone where none is known of the run."""
+    known = metrics.confidence
+    if known.run is not None:
+        return known.run, "err by at most 1 % of their path"
+    within = percent(known.shape_within or 0.0)
+    return known.shape, f"err in shape, after one fitted scale, by at most {within} of their path"
+
+
 def percent(share: float) -> str:
     """A share as words, with two digits where it is small."""
     return f"{100 * share:.2g} %" if abs(share) < 0.1 else f"{100 * share:.0f} %"
@@ -62,12 +71,8 @@ def _sentence(metrics: Metrics) -> str:
     unit = "are in camera heights over the learned road, not in metres"
     unit = f"its lengths {unit if metrics.unit == CAMERA_HEIGHTS else 'have no metric unit'}"
     if error is None:
-        sure = metrics.confidence.run
-        likely = (
-            f": {percent(sure)} of drives like it err by at most 1 % of their path"
-            if sure is not None
-            else ""
-        )
+        sure, words = how_sure(metrics)
+        likely = f": {percent(sure)} of drives like it {words}" if sure is not None else ""
         closed = next((f", and {words}" for is_sign, words in _loops(metrics) if is_sign), "")
         unit = "its lengths are in metres" if metrics.is_metric else unit
         return f"Without a truth its error is unknown{likely}{closed}; {unit}."
@@ -112,12 +117,9 @@ def _loops(metrics: Metrics) -> Iterator[tuple[bool, str]]:
 
 
 def _confidence(metrics: Metrics) -> Iterator[tuple[bool, str]]:
-    sure = metrics.confidence.run
+    sure, words = how_sure(metrics)
     if sure is not None:
-        yield (
-            sure > _SURE,
-            f"{percent(sure)} of drives with images like its own err by at most 1 % of their path",
-        )
+        yield sure > _SURE, f"{percent(sure)} of drives with images like its own {words}"
     elif not metrics.confidence.absent:
         yield False, f"its confidence is not known: {metrics.confidence.why('run')}"
 

@@ -76,6 +76,7 @@ _COLMAP: dict[str, tuple[tuple[int, ...], tuple[int, ...], str]] = {
     "OPENCV_FISHEYE": ((0, 1, 2, 3), (4, 5, 6, 7), "fisheye"),
     "FULL_OPENCV": ((0, 1, 2, 3), (4, 5, 6, 7, 8, 9, 10, 11), "opencv"),
 }
+_VINS_COEFFICIENTS = ("k1", "k2", "p1", "p2")
 _NAMELESS = (4, 5, 8)  # coefficients of OpenCV, which files without a name of the lens mean
 _ZOOM_STEP = 1.02
 _ZOOM_LIMITS = (0.2, 8.0)
@@ -313,7 +314,9 @@ def _vins(content: Keys) -> Keys:
     pinhole, lens = content["projection_parameters"], content["distortion_parameters"]
     focal = (pinhole[name] for name in ("fx", "fy", "cx", "cy"))
     keys = pinhole_keys(content["image_width"], content["image_height"], *focal)
-    return {**keys, "model": "opencv", "distortion": [lens[n] for n in ("k1", "k2", "p1", "p2")]}
+    if unused := [name for name in lens if lens[name] and name not in _VINS_COEFFICIENTS]:
+        raise DataError(f"{', '.join(unused)} of VINS cannot be used: give a camera.yaml")
+    return {**keys, "model": "opencv", "distortion": [lens[n] for n in _VINS_COEFFICIENTS]}
 
 
 def _colmap(text: str) -> Keys:
@@ -323,7 +326,8 @@ def _colmap(text: str) -> Keys:
         _, name, width, height, *words = rows[0]
         if name not in _COLMAP:
             raise DataError(
-                f"COLMAP's camera model {name} is unknown: known are {', '.join(_COLMAP)}"
+                f"COLMAP's camera model {name} is unknown: known are {', '.join(_COLMAP)}; fx fy cx cy alone, as of "
+                "DROID-SLAM, lack the size of images: give a camera.yaml"
             )
         places, coefficients, model = _COLMAP[name]
         if len(words) != 1 + max(places + coefficients):

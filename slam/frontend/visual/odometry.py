@@ -54,7 +54,7 @@ from slam.geometry.multiview import (
     triangulated_nearness,
 )
 from slam.geometry.robust import MAD_TO_SIGMA, mad_sigma, weighted_median
-from slam.geometry.se3 import FloatArray, invert, make
+from slam.geometry.se3 import FloatArray, apply, invert, make
 from slam.runtime.errors import Failed
 
 logger = logging.getLogger(__name__)
@@ -65,6 +65,7 @@ STILL_SOURCE = "still"
 _MIN_RATIOS = 8
 _PNP_ITERATIONS = 200
 _LEAST_PNP_SHARE = 0.5  # of the corners: what fewer agree on is chance
+_NEARLY_ALL = 0.9  # of the corners fit: new ones among them have a vote on the next step
 _LEAST_SUPPORT = 0.25  # of those that were sought: where kerbs repeat, the others are far ahead
 _LEARNED_RELATIVE_SIGMA = 0.1
 _LEARNED_LENGTH_RELATIVE_SIGMA = 0.05
@@ -400,27 +401,41 @@ class VisualOdometry:
         self, ends: Ends, tracks: Tracks, votes: NDArray[np.bool_], depth: FloatArray
     ) -> Motion | Failed:
         """Perspective-n-point of the later image's corners on the earlier frame's learned depth."""
-        known = np.isfinite(depth) & votes
-        if known.sum() < MIN_INLIERS:
-            return Failed(f"only {int(known.sum())} corners have a trusted depth")
+        known = np.isfinite(depth)
+        voters = np.flatnonzero(votes[known])
+        if len(voters) < MIN_INLIERS:
+            return Failed(f"only {len(voters)} corners have a trusted depth")
         corrected = self.depth_error.corrected(depth[known])
         points_previous = self._intrinsics.rays(tracks.previous[known]) * corrected[:, None]
         pixels, K = tracks.current[known], self._intrinsics.K
-        T_start, inliers = consensus(
-            points_previous, pixels, K, _PNP_ITERATIONS, _REPROJECTION_PX, self._seed
+        T_start, agreeing = consensus(
+            points_previous[voters],
+            pixels[voters],
+            K,
+            _PNP_ITERATIONS,
+            _REPROJECTION_PX,
+            self._seed,
         )
-        count = len(inliers)
-        if count < max(MIN_INLIERS, _LEAST_PNP_SHARE * len(pixels), _LEAST_SUPPORT * tracks.sought):
-            known_corners = f"{count} of {len(pixels)} corners"
+        trusted = voters[agreeing]
+        if len(trusted) < max(MIN_INLIERS, _LEAST_PNP_SHARE * len(voters)):
+            known_corners = f"{len(trusted)} of {len(voters)} corners"
             return Failed(f"little parallax, and only {known_corners} agree with the learned depth")
-        resection = resect([T_start], points_previous[inliers], pixels[inliers], K)
-        self._fitted = tracks.track_ids[known][inliers]
+        resection = resect([T_start], points_previous[trusted], pixels[trusted], K)
+        points_current = apply(resection.T_camera_world, points_previous)
+        errors = self._intrinsics.project(points_current) - pixels
+        fits = np.linalg.norm(errors, axis=1) < _REPROJECTION_PX
+        if fits.mean() < _NEARLY_ALL:  # no new corner is given a vote: something passes, or repeats
+            fits = np.isin(np.arange(len(fits)), trusted)
+        support = float(fits.sum() / tracks.sought)
+        if support < _LEAST_SUPPORT:
+            return Failed(f"little parallax, and only {fits.sum()} of {tracks.sought} corners fit")
+        self._fitted = tracks.track_ids[known][fits]
         length = float(np.linalg.norm(resection.T_camera_world[:3, 3]))
         # errors of corners are correlated, and so are those of learned depth
         floors = np.repeat([_LEAST_ROTATION_SIGMA, _LEARNED_RELATIVE_SIGMA * length], 3)
         sigmas = np.hypot(CORNER_CORRELATION * resection.sigmas, floors)
         pose = RelativePose(*ends, invert(resection.T_camera_world), sigmas, PNP_SOURCE)
-        return Motion(pose, support=count / tracks.sought)
+        return Motion(pose, support=support)
 
 
 @dataclass(frozen=True)

@@ -176,6 +176,21 @@ def test_without_metres_and_of_a_carried_camera_no_number_is_said(
     assert isinstance(agreement.confidence([], is_metric, is_carried), Failed)
 
 
+@pytest.mark.parametrize(("sigmas", "drift"), [(3.5, 0.0), (0.0, 0.035)])
+def test_a_shape_is_doubtful_by_contradictions_and_by_its_drift(
+    sigmas: float, drift: float
+) -> None:
+    said = [agreement.Agreement("gaps", sigmas, "")]
+    assert agreement.shape_confidence(said, drift) < 0.5 < agreement.shape_confidence([], 0.01)
+
+
+def test_noise_of_creeping_steps_does_not_point_aside() -> None:
+    poses = np.tile(np.eye(4), (600, 1, 1))
+    poses[:, 0, 3] = np.random.default_rng(0).normal(0.0, 0.005, 600)
+    poses[:, 2, 3] = 0.01 * np.arange(600)
+    assert agreement.of_directions(poses).sigmas < agreement.DOUBTFUL
+
+
 def test_two_contradictions_are_two_warnings(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

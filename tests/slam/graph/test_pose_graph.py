@@ -150,6 +150,16 @@ def test_wrong_input_is_refused_with_its_name(tmp_path: Path) -> None:
         graph.marginal(5)
 
 
+def test_drift_of_a_straight_chain_by_hand() -> None:
+    """The variance of the k-th of eight positions is 3 k 0.1^2, over a path of 8."""
+    sigmas = np.repeat([1e-6, 0.1], 3)
+    step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    graph = PoseGraph()
+    graph.add_relative(*(RelativePose(k, k + 1, step, sigmas, "network") for k in range(8)))
+    graph.optimise(se3.chain(np.tile(step, (8, 1, 1))))
+    assert graph.drift() == pytest.approx(np.sqrt(0.03 * 4.5) / 8, rel=1e-3)
+
+
 def test_whitened_residual_by_hand():
     sigmas = np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])
     measured = RelativePose(0, 1, np.eye(4), sigmas, "network")

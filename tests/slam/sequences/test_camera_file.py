@@ -242,6 +242,12 @@ def test_settings_of_vins(tmp_path: Path) -> None:
     (tmp_path / "vins.yaml").write_text(VINS)
     camera = read_explicit(tmp_path / "vins.yaml")
     assert (camera.model, camera.fy, camera.distortion) == ("opencv", 31, (-0.1, 0.02, 0.0, 0.0))
+    (tmp_path / "vins.yaml").write_text(VINS.replace("p2: 0.0", "p2: 0.0, k3: 0.1"))
+    with pytest.raises(DataError, match="k3 of VINS cannot be used"):
+        read_explicit(tmp_path / "vins.yaml")
+    (tmp_path / "droid.txt").write_text("30 31 20 12\n")
+    with pytest.raises(DataError, match="DROID-SLAM, lack the size"):
+        read_explicit(tmp_path / "droid.txt")
 
 
 @pytest.mark.parametrize("name", LENSES)

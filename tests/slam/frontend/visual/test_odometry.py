@@ -135,6 +135,19 @@ def test_pure_rotation_is_measured_by_pnp(texture):
     assert (measured.sigmas > 0).all()
 
 
+def test_corners_that_come_into_view_speak_for_the_next_turn(texture):
+    """The camera turns until it sees nothing of what it saw at first."""
+    turn = se3.from_rotation_vector(np.deg2rad([0.0, 3.0, 0.0]), np.zeros(3))
+    odometry, pose = VisualOdometry(CAMERA), np.eye(4)
+    previous, depth = render(pose, texture)
+    for index in range(1, 31):
+        pose = pose @ turn
+        current, next_depth = render(pose, texture, index)
+        motion = odometry.measure(previous, current, UNIT * depth, 1.65 * UNIT)
+        assert pose_of(motion).source == "pnp" and motion.support > 0.5
+        previous, depth = current, next_depth
+
+
 def test_standing_still_is_the_identity(texture):
     measured = pose_of(measure(np.eye(4), texture))
     assert measured.source == "still"

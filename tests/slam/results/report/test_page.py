@@ -218,6 +218,8 @@ def test_the_first_sentence_says_how_good_it_is_and_why(
     unknown = said(**make_metrics(reference=False, mode="none"), confidence={"run": 0.97})
     assert "its error is unknown: 97 % of drives like it" in unknown
     unsaid = said(confidence={"run": None, "run_reason": "the camera is carried"})
+    of_shape = said(confidence={"run": None, "shape": 0.9, "shape_within": 0.03})
+    assert "90 % of drives with images like its own err in shape" in str(of_shape)
     assert "the camera is carried" in unsaid and "of drives" not in unsaid
 
 

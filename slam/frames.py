@@ -53,6 +53,11 @@ class Intrinsics(Pinhole):
         """The camera matrix ``(3, 3)``, pixels."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
+    @property
+    def focal_half_widths(self) -> float:
+        """The focal length over half the width of the image."""
+        return 2.0 * self.fx / self.width
+
     def rays(self, pixels: NDArray[Any]) -> FloatArray:
         """Rays ``(..., 3)`` with z = 1 through pixels ``(..., 2)``."""
         u, v = np.moveaxis(np.asarray(pixels), -1, 0)

@@ -16,11 +16,11 @@ from scipy.spatial import cKDTree
 from erfsfm.common.errors import ErfsfmError
 from erfsfm.common.files import refuse_foreign
 from erfsfm.common.progress import Progress, silent
-from erfsfm.common.readers.camera_file import CAMERA_FILE
+from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile, Pinhole
 from slam.formats.colmap import BINARY_FOLDER, HEADER, MODEL_FILES, Sightings, write_colmap
 from slam.formats.ply import R_UP_WORLD, Ply, read_ply, rotated, write_ply
 from slam.formats.trajectory import Trajectory, nearest_stamps, read_trajectory
-from slam.frames import Intrinsics, Sequence
+from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.loops.places import Places, PlaceStructure
@@ -29,7 +29,9 @@ from slam.mapping.occupancy import occupancy_grid, write_ros_map
 from slam.results.folder import RunFolder, check_replaced
 from slam.results.metrics import CAMERA_HEIGHTS, METRES
 from slam.runtime.errors import RunError, SlamError
-from slam.runtime.files import ESTIMATE, MAP_CLOUD, MAP_MESH, PLACES, write_atomically
+from slam.runtime.files import ESTIMATE, MAP_CLOUD, MAP_MESH, MASK, PLACES, write_atomically
+from slam.sequences.camera_file import write_camera
+from slam.sequences.recording import RecordedSequence
 from slam.simulation.recording import open_or_embedded
 
 logger = logging.getLogger(__name__)
@@ -37,6 +39,7 @@ logger = logging.getLogger(__name__)
 R_UP_WORLDS = {"y-down": np.eye(3), "z": R_UP_WORLD}  # from a camera's x right, y down, z ahead
 POINTS, TRANSFORMS = "points.ply", "transforms.json"
 _IMAGES = "images"
+_DRIVE = _IMAGES, CAMERA_FILE, MASK
 _MADE_BY = {"made_by": "erfsfm-slam"}
 _MAPS = {"mesh": MAP_MESH, "cloud": MAP_CLOUD}
 _SUFFIXES = {
@@ -47,8 +50,8 @@ _SUFFIXES = {
     "nerfstudio": (),
 }
 _SCENES = {  # files, and what one of them holds if it is ours
-    "colmap": ((_IMAGES, BINARY_FOLDER, *MODEL_FILES), HEADER),
-    "nerfstudio": ((_IMAGES, POINTS, TRANSFORMS), json.dumps(_MADE_BY)[1:-1]),
+    "colmap": ((*_DRIVE, BINARY_FOLDER, *MODEL_FILES), HEADER),
+    "nerfstudio": ((*_DRIVE, POINTS, TRANSFORMS), json.dumps(_MADE_BY)[1:-1]),
 }
 _T_CAMERA_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _HALF_PIXEL = 0.5  # (0.5, 0.5) is the centre of their top-left pixel
@@ -275,6 +278,10 @@ def _write_images(
         logger.warning(
             "%d of %d frames have no usable image: left out", len(rows) - len(written), len(rows)
         )
+    # for erfsfm train, which takes images without distortion alone
+    rate = 1.0 / float(np.median(np.diff(sequence.stamps)))
+    camera = CameraFile(**vars(Pinhole.of(sequence.intrinsics)), fps=rate)
+    write_camera(output, camera, sequence.fixed)
     return sequence.intrinsics, written
 
 
@@ -285,7 +292,7 @@ def _image_name(frame: int) -> str:
 
 def _recording(
     folder: RunFolder, trajectory: Trajectory, dataset: Path | None
-) -> tuple[Sequence, list[int | None]]:
+) -> tuple[RecordedSequence, list[int | None]]:
     """The recording of a run, and which frame of it, by its stamp, each row of the trajectory is."""
     recorded = folder.metrics().provenance.recording
     if recorded is None and dataset is None:

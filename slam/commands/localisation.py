@@ -13,12 +13,12 @@ from scipy.spatial.distance import cdist
 
 from erfsfm.common.errors import DataError
 from erfsfm.common.progress import Progress, silent
-from erfsfm.common.readers.camera_file import CAMERA_FILE
+from erfsfm.common.readers.camera_file import CAMERA_FILE, read_camera_file
 from erfsfm.common.readers.images import image_folder, list_images, read_image
 from erfsfm.common.readers.numbering import in_order
 from erfsfm.common.table import DASH, Table
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
-from slam.frames import Frame, Image, Intrinsics, View
+from slam.frames import Frame, Image, Intrinsics, Mask, View
 from slam.geometry.multiview import Resection, consensus, pixel_jacobian, resect
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray, apply, invert
@@ -29,7 +29,13 @@ from slam.loops.vocabulary import PlaceIndex
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
 from slam.runtime.files import PLACES
-from slam.sequences.camera_file import beside, explicit_camera, require_stated, undistorted
+from slam.sequences.camera_file import (
+    beside,
+    explicit_camera,
+    fixed_to,
+    require_stated,
+    undistorted,
+)
 from slam.sequences.images import ImageFiles
 from slam.sequences.recording import frame_range
 
@@ -115,13 +121,19 @@ def localise(
         own_camera = beside(paths[0].parent, folder, folder.absolute().parent)
     else:
         own_camera = explicit_camera(camera, ImageFiles(in_order(paths)))
+    of_run = run.path / CAMERA_FILE
+    if is_of_run := own_camera is None and of_run.is_file():
+        own_camera = read_camera_file(of_run)
     if own_camera is None and places.intrinsics.undistorted:
         raise SequenceError(
             f"{run.path} undistorted its images, and {images} has no {CAMERA_FILE}: give its --camera, which is fov=70 "
             "for images without distortion"
         )
-    intrinsics, undistortion = (None, None) if own_camera is None else undistorted(own_camera)
-    localiser = Localiser(places, intrinsics)
+    intrinsics = undistortion = fixed = None
+    if own_camera is not None:
+        intrinsics, undistortion = undistorted(own_camera)
+        fixed = fixed_to(own_camera, undistortion)
+    localiser = Localiser(places, None if is_of_run else intrinsics, fixed)
     numbers, found, unreadable = range(first, last, every), [], 0
     for number in numbers:
         name = paths[number].name
@@ -174,11 +186,16 @@ def write_localisations(path: Path, found: Sequence[Localisation]) -> None:
 class Localiser:
     """Localises single images among the places of one run; no network is used."""
 
-    def __init__(self, places: Places, intrinsics: Intrinsics | None = None) -> None:
-        """``intrinsics`` are of the new images; without any they are resized to those of the run."""
+    def __init__(
+        self, places: Places, intrinsics: Intrinsics | None = None, fixed: Mask | None = None
+    ) -> None:
+        """``intrinsics`` are of the new images; without any they are resized to those of the run.
+
+        ``fixed`` ``(h, w)`` is True where they show what is fixed to their camera.
+        """
         self._places = places
         self._thresholds = replace(OF_FRAMES, max_hamming=OF_KEYFRAMES.max_hamming)
-        self._resizes = intrinsics is None
+        self._resizes, self._fixed = intrinsics is None, fixed
         self._intrinsics = intrinsics or places.intrinsics
         self._features = FeatureExtractor(self._intrinsics)
         self._structure = PlaceStructure(places, self._thresholds)
@@ -218,7 +235,7 @@ class Localiser:
                 raise SequenceError(
                     f"the image is {width}x{height}, its camera {camera.width}x{camera.height}: give its --camera"
                 )
-        frame = Frame(0, 0.0, image).resized(camera.width, camera.height)
+        frame = Frame(0, 0.0, image, self._fixed).resized(camera.width, camera.height)
         return self._features.view(frame, np.full(frame.grey.shape, np.nan, np.float32))
 
     def _found(self, rows: list[int], view: View, learned: bool) -> Localisation:

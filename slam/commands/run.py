@@ -7,11 +7,9 @@ import logging
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypedDict, Unpack
 
-import yaml
 from pydantic import BeforeValidator, Field, ValidationError
 
 from erfsfm import __version__
@@ -20,14 +18,14 @@ from erfsfm.common.errors import explained, without_secrets
 from erfsfm.common.files import FolderLock
 from erfsfm.common.processes import limit_library_threads
 from erfsfm.common.progress import Progress, progress_bar, progress_lines, silent
-from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile
+from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.signals import raising_on_termination
 from erfsfm.inference import DepthPosePredictor, commit
 from slam.config.sections import SlamConfig, dump_yaml, load_config
 from slam.evaluation.map import double_wall_share
 from slam.formats.ply import Ply
 from slam.formats.trajectory import Trajectory
-from slam.frames import Frame, Image
+from slam.frames import Frame, Image, Mask, resized_mask
 from slam.frames import Sequence as FrameSequence
 from slam.frontend.fixed_mask import FixedMask
 from slam.frontend.self_calibration import MOST_FRAMES, find_camera
@@ -69,7 +67,7 @@ from slam.runtime.files import (
     source_from_anywhere,
 )
 from slam.runtime.imports import import_extra
-from slam.sequences.camera_file import AUTO, is_auto
+from slam.sequences.camera_file import AUTO, is_auto, write_camera
 from slam.sequences.gps_track import read_gps
 from slam.sequences.recording import RecordedSequence
 from slam.simulation.recording import open_or_embedded
@@ -156,6 +154,7 @@ class FolderRecorder(Recorder):
     def begin(self) -> None:
         """The metrics and settings of a run that begins; the source of depth by its whole path."""
         self.folder.write_metrics(self._metrics)
+        self._write_camera(None)
         depth = self._settings.depth
         depth = depth.model_copy(update={"source": source_from_anywhere(depth.source)})
         self.folder.write(CONFIG, dump_yaml(self._settings.model_copy(update={"depth": depth})))
@@ -175,6 +174,7 @@ class FolderRecorder(Recorder):
         if not isinstance(estimate.graph, Failed):
             estimate.graph.write_g2o(folder.path / GRAPH)
         folder.write(LOOPS, json.dumps(estimate.loops.details(), indent=2, allow_nan=False))
+        self._write_camera(estimate.drive.measured.fixed)
         folder.write(PLACES, estimate.places(sequence.intrinsics).write)
         with estimate.stopwatch.stage("evaluation"):
             self._metrics = estimate_metrics(
@@ -184,6 +184,18 @@ class FolderRecorder(Recorder):
         self._stopwatch = estimate.stopwatch
         self._quality = DepthQuality(sequence, estimate.scale.is_metric)
         self._depths = DepthPictures(len(sequence))
+
+    def _write_camera(self, fixed: Mask | None) -> None:
+        """The camera for a next run, with what is ``fixed`` ``(h, w)`` to it, where no calibration says as much."""
+        sequence = self.pipeline.sequence
+        assert isinstance(sequence, RecordedSequence)
+        camera = sequence.camera
+        if not isinstance(camera, CameraFile) or (fixed is None and not camera.fx_sigma):
+            return
+        if fixed is not None:
+            fixed, lens = resized_mask(fixed, camera.width, camera.height), sequence.undistortion
+            fixed = fixed if lens is None else lens.as_stored(fixed)
+        write_camera(self.folder.path, camera, fixed)
 
     def keyframe(self, keyframe: KeyframeDepth) -> None:
         """Compared with the truth, and drawn for the report."""
@@ -346,9 +358,6 @@ def perform(request: RunRequest) -> RunFolder:
         pipeline = SlamPipeline(recording, predictor, settings, progress, request.seed, track)
         pipeline.require_possible()
         folder = RunFolder.create(request.output, Path(settings.output.root), recording.name, lock)
-        if isinstance(recording.camera, CameraFile) and recording.camera.fx_sigma:
-            keys = recording.camera.model_dump(mode="json")
-            folder.write(CAMERA_FILE, yaml.safe_dump(keys, sort_keys=False, width=1000))
         recorder = FolderRecorder(
             folder,
             pipeline,
@@ -379,13 +388,14 @@ def open_recording(request: RunRequest) -> RecordedSequence:
         return recording
     total, fixed = min(len(recording), MOST_FRAMES), FixedMask()
     look_ahead(recording, fixed)
+    recording.fixed = fixed.mask
 
     def frames() -> Iterator[Frame]:
         for index in range(total):
             request.progress("camera", index + 1, total)
             frame = read_frame(recording, index)
             if isinstance(frame, Frame):
-                yield replace(frame, fixed=fixed.mask)
+                yield frame
 
     found = find_camera(frames())
     said = found.sentence(camera.width)

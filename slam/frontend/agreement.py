@@ -7,7 +7,6 @@ from both.
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -17,9 +16,9 @@ from scipy.special import erf
 from slam.frames import Ends, Intrinsics, RelativePose, runs
 from slam.frontend.drive import Drive
 from slam.frontend.measured import named
-from slam.frontend.self_calibration import SURE
+from slam.frontend.self_calibration import SURE, FoundCamera, check_camera
+from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.motion import Motion
-from slam.frontend.visual.self_calibration import DepthError, FocalLength
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.runtime.errors import Failed, SlamError
@@ -33,8 +32,6 @@ _USUAL_HEIGHT_M, _USUAL_FACTOR = 1.0, 10.0  # of cameras whose height nobody sta
 _DEPTH = 0.2  # relative, of a good source of depth
 _DRIFT = 0.005  # of the distance travelled, what an aligned path keeps of it
 _LEAST = 5  # compared values
-_FOCAL = 0.04  # relative, of the focal length that corners show: flow and lens bias it
-_TELLING_FOCAL = 0.1  # largest sigma of one that says something
 # of good drives (docs/reliability.md): mean and spread
 _USUAL_SUPPORT, _SUPPORT_SPREAD = 0.6, 0.13
 _WEAK_SUPPORT, _LEAST_WEAK = 0.2, 10  # and frames in a row that are a doubt
@@ -237,8 +234,8 @@ def of_images(
     if needs_road and steps and too_far is not None:
         figure = f"it is up to {100 * np.expm1(too_far):.0f} % farther than triangulated, as where a lens zooms"
         compared("learned depth far away", too_far / _FAR_SPREAD, figure)
-    by_corners = of_focal_length(drive.measured.focal_length, camera)
-    if by_corners is not None:
+    found = check_camera(drive.measured.corners, camera)
+    if (by_corners := of_focal_length(found, camera)) is not None:
         agreements.append(by_corners)
     for each in agreements[1:]:  # gaps and segments were said by their frames
         each.said()
@@ -257,18 +254,13 @@ def _overlap(support: FloatArray) -> tuple[float, str]:
     return sigmas, figure
 
 
-def of_focal_length(found: FocalLength, camera: Intrinsics) -> Agreement | None:
-    """By the focal length that corners show; None where they show too little. A rough guess is a doubt in any case."""
-    logarithm, sigma = found.error or (0.0, np.inf)
-    sigmas = abs(logarithm) / math.hypot(_FOCAL, sigma, camera.focal_sigma)
-    is_guess = camera.focal_sigma > SURE
-    figure = "nobody calibrated it" if is_guess else ""
-    if sigma < _TELLING_FOCAL or (sigmas > DOUBTFUL and not is_guess):
-        figure += f"{', ' if figure else ''}measured from corners it is {100 * np.exp(logarithm):.0f} % of the given"
-        figure += f", give or take {100 * sigma:.0f} %"
-        if sigmas > _CLEAR:
-            figure += ": --camera auto measures it where the camera turns"
-    if is_guess:
+def of_focal_length(found: FoundCamera, camera: Intrinsics) -> Agreement | None:
+    """By the one that windows of corners show; None where it is not contradicted. A rough guess is always a doubt."""
+    sigmas, figure = found.sigmas_from(camera), ""
+    if sigmas > _CLEAR:
+        figure = f"{found.sentence(camera.width)}: try --camera auto"
+    if camera.focal_sigma > SURE:
+        figure = figure or "nobody calibrated it"
         return Agreement("the guessed focal length", max(sigmas, _CAPPED), figure, "good drives")
     return Agreement("the focal length", sigmas, figure) if figure else None
 

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import Grey, Mask, shrunk, slopes_of
+from slam.frames import Grey, Mask, resized_mask, shrunk, slopes_of
 
 logger = logging.getLogger(__name__)
 
@@ -71,14 +71,17 @@ class FixedMask:
         # over the images that counted: both slopes, their length, and the slope towards the middle, also its size
         self._means: _Layer = np.zeros((5, 0, 0), np.float32)
 
-    def follow(self, grey: Grey) -> None:
-        """Look at some of the images ``(H, W)`` that follow each other."""
+    def follow(self, grey: Grey, given: Mask | None = None) -> None:
+        """Look at some of the images ``(H, W)`` that follow each other; arguments as in `look_at`."""
         self._seen += 1
         if self._seen % (_EVERY if self._counted >= LEAST_IMAGES else _EVERY_FIRST) == 0:
-            self.look_at(grey)
+            self.look_at(grey, given)
 
-    def look_at(self, grey: Grey) -> None:
-        """Look at an image ``(H, W)``, which counts if most of it has moved since the last one that counted."""
+    def look_at(self, grey: Grey, given: Mask | None = None) -> None:
+        """Look at an image ``(H, W)``, which counts if most of it has moved since the last one that counted.
+
+        A mask that is ``given`` ``(H, W)`` is joined with what is found.
+        """
         local = _local(grey)
         slopes = slopes_of(local)
         length = cv2.magnitude(*slopes)
@@ -96,6 +99,8 @@ class FixedMask:
         self._means += (now - self._means) / np.float32(min(self._counted, _REMEMBERED_IMAGES))
         if self._counted % LEAST_IMAGES == 0:
             self.mask = self._found()
+            if self.mask is not None and given is not None:
+                self.mask |= resized_mask(given, *local.shape[::-1])
 
     def _has_moved(self, change: _Layer, length: _Layer) -> bool:
         """Whether most of what is not fixed has moved: a lorry that passes a waiting car is not most of it."""

@@ -10,27 +10,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Frame
-from slam.frontend.tracking import Search, Texture, are_inside, new_corners, track
+from slam.frontend.tracking import CornerTracker
 from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray
 
-# corners of plain walls creep, and windows beyond the border slip: both bend a focal length by 3 %
-_SEARCH = Search(
-    side=16, levels=4, limits=(20, 0.02), back=None, error_px=0.5, norm=np.inf, texture=1e-4
-)
-_CORNERS = Texture(quality=0.01, spacing_px=10.0, block_px=5)
-_MOST_CORNERS, _WIDTH_PX, _BORDER_PX = 500, 960, 8.0
-_KEYFRAME_MOVED = 0.06  # of half the width, from keyframe to keyframe
+_WIDTH_PX = 960
+_MOST_KEYFRAMES = 450
+_KEYFRAME_MOVED = 0.06  # half widths, from keyframe to keyframe
 _KEYFRAME_LOST = 0.5  # of the corners of the last keyframe
 
 
 @dataclass(frozen=True)
 class FollowedCorners:
-    """``S`` sightings: rows of keyframes and points ``(S,)``, ``image`` ``(S, 2)`` in half widths from the middle."""
+    """``S`` sightings: rows of keyframes and points ``(S,)``, ``image`` ``(S, 2)`` in half widths from the middle.
+
+    ``pixel`` is the size of a pixel in half widths.
+    """
 
     keyframe: NDArray[np.int64]
     point: NDArray[np.int64]
     image: FloatArray
+    pixel: float
 
     def __len__(self) -> int:
         return len(self.keyframe)
@@ -47,44 +47,47 @@ class FollowedCorners:
         keyframe, point, image = self.keyframe[rows], self.point[rows], self.image[rows]
         often = np.bincount(point)[point] >= least
         points, numbers = np.unique(point[often], return_inverse=True)
-        return FollowedCorners(keyframe[often], numbers, image[often]), points
+        return FollowedCorners(keyframe[often], numbers, image[often], self.pixel), points
 
 
-def follow(frames: Iterable[Frame]) -> tuple[FollowedCorners, float]:
-    """Corners in the keyframes of some frames, and the size of a pixel in half widths."""
-    rows: list[FloatArray] = []
-    pixels, ids = np.zeros((0, 2), np.float32), np.zeros(0, np.int64)
-    last, last_ids, sought, width, before = pixels, ids, 0, 1, None
+class CornerRecord:
+    """Collects the corners of keyframes: of images so far apart that turns are told."""
+
+    def __init__(self) -> None:
+        self._last, self._last_ids = np.zeros((0, 2)), np.zeros(0, np.int64)
+        self._rows: list[FloatArray] = [np.zeros((0, 4))]
+
+    def add(self, ids: NDArray[np.int64], image: FloatArray) -> None:
+        """Keep the corners of an image, by their identifiers ``(M,)`` and in half widths ``(M, 2)``, if it is far."""
+        _, own, at_last = np.intersect1d(ids, self._last_ids, return_indices=True)
+        moved = np.linalg.norm(image[own] - self._last[at_last], axis=1)
+        is_near = (
+            len(own) > _KEYFRAME_LOST * len(self._last_ids) and median(moved) < _KEYFRAME_MOVED
+        )
+        keyframe = len(self._rows) - 1
+        if is_near or keyframe == _MOST_KEYFRAMES:
+            return
+        self._last, self._last_ids = image, ids
+        self._rows.append(np.column_stack([np.full(len(ids), keyframe), ids, image]))
+
+    def seen(self, pixel: float = 1.0) -> FollowedCorners:
+        """All keyframes so far, and the size of a pixel in half widths."""
+        table = np.concatenate(self._rows)
+        keyframes, points = table[:, :2].T.astype(np.int64)
+        return FollowedCorners(keyframes, points, table[:, 2:], pixel)
+
+
+def follow(frames: Iterable[Frame]) -> FollowedCorners:
+    """Corners in the keyframes of some frames."""
+    record, tracker, before, width = CornerRecord(), CornerTracker(), None, 1
     for frame in frames:
-        frame = _narrow(frame)
+        height, width = frame.image.shape[:2]
+        ratio = min(_WIDTH_PX / width, 1.0)  # following corners of wide images takes long
+        frame = frame.resized(round(ratio * width), round(ratio * height))
         height, width = frame.grey.shape
         if before is not None:
-            pixels, kept = track(before, frame.grey, pixels, _SEARCH)
-            inner = height - 2 * _BORDER_PX, width - 2 * _BORDER_PX
-            kept &= are_inside(pixels - _BORDER_PX, inner) & ~frame.is_fixed(pixels)
-            pixels, ids = pixels[kept], ids[kept]
-        before = frame.grey
-        _, own, at_last = np.intersect1d(ids, last_ids, return_indices=True)
-        moved = np.linalg.norm(pixels[own] - last[at_last], axis=1)
-        if (
-            len(own) > _KEYFRAME_LOST * len(last_ids)
-            and median(moved) < _KEYFRAME_MOVED * width / 2
-        ):
-            continue
-        corners = new_corners(frame, pixels, _MOST_CORNERS - len(pixels), _CORNERS)
-        pixels = np.concatenate([pixels, corners])
-        ids = np.concatenate([ids, sought + np.arange(len(corners))])
-        sought += len(corners)
-        last, last_ids = pixels, ids
-        image = (pixels - [(width - 1) / 2, (height - 1) / 2]) * (2.0 / width)
-        rows.append(np.column_stack([np.full(len(ids), len(rows)), ids, image]))
-    table = np.concatenate(rows) if rows else np.zeros((0, 4))
-    keyframes, points = table[:, :2].T.astype(np.int64)
-    return FollowedCorners(keyframes, points, table[:, 2:]), 2.0 / width
-
-
-def _narrow(frame: Frame) -> Frame:
-    """The same image, at most so wide that following its corners is quick."""
-    height, width = frame.image.shape[:2]
-    narrow = min(width, _WIDTH_PX)
-    return frame.resized(narrow, round(height * narrow / width))
+            tracks = tracker.track(before, frame)
+            middle = (width - 1) / 2, (height - 1) / 2
+            record.add(tracks.track_ids, (tracks.current - middle) * (2.0 / width))
+        before = frame
+    return record.seen(2.0 / width)

@@ -141,7 +141,7 @@ class MotionTracker:
         self.choose()
         measured = self._measured.copy()
         measured.depth_error = self.step_odometry.depth_error
-        measured.focal_length = self.step_odometry.focal_length
+        measured.corners = self.step_odometry.corners.seen(2.0 / self._intrinsics.width)
         if self._keyframes is not None:
             measured.events = list(self._keyframes.events)
         parts: list[LocalMap] = []

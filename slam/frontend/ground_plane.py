@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Intrinsics
-from slam.frontend.visual.self_calibration import DepthError
+from slam.frontend.visual.depth_error import DepthError
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import Failed
 

@@ -23,10 +23,11 @@ from slam.frames import (
     resized_depth,
     runs,
 )
+from slam.frontend.followed_corners import CornerRecord, FollowedCorners
 from slam.frontend.keyframes.local_map import LocalMap
 from slam.frontend.road import RoadStep
+from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.motion import Motion, RelativeRotation, Steps
-from slam.frontend.visual.self_calibration import DepthError, FocalLength
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import Failed
 from slam.runtime.memory import SpilledArray, SpillFile
@@ -106,7 +107,7 @@ class Measured:
 
     Known once the front end has finished:
         depth_error: of learned depth, as the steps have it.
-        focal_length: the one that corners show, as the steps have it.
+        corners: that the steps followed, from the principal point.
         maps: of keyframes; a drive measured by steps alone has none.
         events: what became of the maps.
     """
@@ -125,7 +126,7 @@ class Measured:
     fixed: Mask | None = None
     below_is_nearer: list[bool] = field(default_factory=list)
     depth_error: DepthError = field(default_factory=DepthError)
-    focal_length: FocalLength = field(default_factory=FocalLength)
+    corners: FollowedCorners = field(default_factory=CornerRecord().seen)
     maps: Sequence[LocalMap] = ()
     events: Sequence[TrackingEvent] = ()
 

@@ -14,7 +14,7 @@ not move with the focal length.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from erfsfm.common.processes import limit_library_threads
 from erfsfm.common.readers.camera_file import UNKNOWN_FOV_DEG, UNKNOWN_FX_SIGMA, CameraFile
-from slam.frames import Frame
+from slam.frames import Frame, Intrinsics
 from slam.frontend.followed_corners import FollowedCorners, follow
 from slam.geometry.multiview import LEAST_DEPTH, pixel_jacobian, rotation_between
 from slam.geometry.robust import mad_sigma, weighted_median
@@ -55,6 +55,8 @@ _TURNING = 0.5  # radians beyond which turns are told without the focal length
 _INFLATED, _FLOOR, _SYSTEMATIC = 3.0, 0.03, 0.02
 _BY_TURN = 0.3  # sigma of a window that turns by one degree; less, as it turns more
 _HUBER = 1.5
+# of a stated camera: points of one window, with which a check takes a second, and sigmas beyond which all are asked
+_CHECKED, _DOUBTFUL = 120, 2.0
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,13 @@ class FoundCamera:
         }
         return guess.model_copy(update=keys)
 
+    def sigmas_from(self, stated: Intrinsics) -> float:
+        """How far the focal length of another camera is from the one found; 0 where none is."""
+        if self.sigma > ROUGH:
+            return 0.0
+        ratio = self.focal / stated.focal_half_widths
+        return abs(math.log(ratio)) / math.hypot(self.sigma, stated.focal_sigma)
+
     def sentence(self, width: int) -> str:
         """What the user is told of it, for images of this width in pixels."""
         fov_deg = 2.0 * np.rad2deg(np.arctan(1.0 / self.focal))
@@ -106,9 +115,21 @@ class FoundCamera:
 def find_camera(frames: Iterable[Frame]) -> FoundCamera:
     """The camera of images of one size, in their order; the prior's with its sigma where it cannot be seen."""
     with limit_library_threads():  # the systems are small
-        seen, pixel = follow(frames)
-        windows = [calibrated(part, pixel) for part in windows_that_turn(seen)]
-    return joined([window for window in windows if window is not None])
+        return joined(map(calibrated, windows_that_turn(follow(frames))))
+
+
+def check_camera(seen: FollowedCorners, stated: Intrinsics) -> FoundCamera:
+    """The camera by the corners that a drive followed, measured from the principal point of the ``stated`` one.
+
+    A few of one window are asked, and all where they contradict it.
+    """
+    windows = windows_that_turn(seen)
+    few = []
+    for window in windows[:1]:
+        longest = np.argsort(-np.bincount(window.point), kind="stable")[:_CHECKED]
+        few.append(window.chosen(np.isin(window.point, longest), least=2)[0])
+    found = joined(map(calibrated, few))
+    return found if found.sigmas_from(stated) < _DOUBTFUL else joined(map(calibrated, windows))
 
 
 @dataclass(frozen=True)
@@ -162,30 +183,30 @@ def windows_that_turn(seen: FollowedCorners) -> list[FollowedCorners]:
     turns = [np.ptp(aside[start : start + count], axis=0).max() for start in starts if count]
     windows = []
     for n in np.argsort(turns)[::-1][:_WINDOWS].tolist():
-        rows = np.flatnonzero((seen.keyframe >= starts[n]) & (seen.keyframe < starts[n] + count))
+        rows = (seen.keyframe >= starts[n]) & (seen.keyframe < starts[n] + count)
         part, _ = seen.chosen(rows, least=3)
         windows.append(replace(part, keyframe=part.keyframe - starts[n]))
     return windows
 
 
-def calibrated(seen: FollowedCorners, pixel: float) -> Window | None:
-    """What a window says of its camera; ``pixel`` is its size in half widths. None where it tells nothing."""
-    if (started := _turning(seen, pixel)) is None:
+def calibrated(seen: FollowedCorners) -> Window | None:
+    """What a window says of its camera; None where it tells nothing."""
+    if (started := _turning(seen)) is None:
         return None
     problem, start = started
-    start, _ = problem.solved(start, _BUT_FOCAL, 0.5 * pixel, _FEW)
-    problem, start = problem.without_outliers(start, 8.0, pixel)
+    start = problem.solved(start, _BUT_FOCAL, 0.5 * seen.pixel, _FEW)
+    problem, start = problem.without_outliers(start, 8.0)
     for _ in range(2):
-        sigma = problem.spread(start, pixel)
-        start, _ = problem.solved(start, _BUT_FOCAL, sigma, _FEW)
+        sigma = problem.spread(start)
+        start = problem.solved(start, _BUT_FOCAL, sigma, _FEW)
     lowest = problem.lowest(start, sigma)
     free = _BUT_FOCAL if lowest is None else _ALL
     start = lowest or start
     for _ in range(3):
-        start, _ = problem.solved(start, free, sigma, _MANY)
-        problem, start = problem.without_outliers(start, 5.0, pixel)
-        sigma = problem.spread(start, pixel)
-    start, _ = problem.solved(start, free, sigma, _MANY)
+        start = problem.solved(start, free, sigma, _MANY)
+        problem, start = problem.without_outliers(start, 5.0)
+        sigma = problem.spread(start)
+    start = problem.solved(start, free, sigma, _MANY)
     if len(problem.seen) < _LEAST_SIGHTINGS:
         return None
     turn = np.linalg.norm(start.turns[:, :2], axis=1).max() + 1e-9
@@ -193,8 +214,9 @@ def calibrated(seen: FollowedCorners, pixel: float) -> Window | None:
     return Window(start.lens, _INFLATED * sigmas, float(np.rad2deg(turn)))
 
 
-def joined(telling: Sequence[Window]) -> FoundCamera:
+def joined(windows: Iterable[Window | None]) -> FoundCamera:
     """The camera by windows, robustly, and a prior; the prior's focal length alone where they say too little."""
+    telling = [window for window in windows if window is not None]
     lenses = np.array([*(window.lens for window in telling), _PRIOR])
     doubts = [math.hypot(w.sigmas[0], _FLOOR, _BY_TURN / w.turn_deg) for w in telling]
     values, sigmas = lenses[:, 0], np.array([*doubts, UNKNOWN_FX_SIGMA])
@@ -223,51 +245,49 @@ def joined(telling: Sequence[Window]) -> FoundCamera:
 class Problem:
     """Bundle adjustment of one window: cameras, homogeneous points and the lens that they share."""
 
-    def __init__(self, seen: FollowedCorners, cameras: int) -> None:
-        self.seen, self._cameras = seen, cameras
+    def __init__(self, seen: FollowedCorners) -> None:
+        self.seen = seen
 
     def errors(self, given: Reconstruction) -> FloatArray:
         """Of the image of each sighting ``(S, 2)``; huge behind the camera."""
         return _bent(self._ideal(given)[0], given.lens)[0] - self.seen.image
 
-    def spread(self, given: Reconstruction, pixel: float) -> float:
+    def spread(self, given: Reconstruction) -> float:
         """Sigma of a coordinate of a sighting."""
         count = 2 * len(self.seen)
-        freedom = count - 6 * (self._cameras - 1) - 3 * len(given.points)
+        freedom = count - 6 * (len(given.T_camera_world) - 1) - 3 * len(given.points)
         inflated = math.sqrt(count / max(freedom, 1))
-        return max(mad_sigma(self.errors(given)) * inflated, 0.08 * pixel)
+        return max(mad_sigma(self.errors(given)) * inflated, 0.08 * self.seen.pixel)
 
     def without_outliers(
-        self, given: Reconstruction, sigmas: float, pixel: float
+        self, given: Reconstruction, sigmas: float
     ) -> tuple[Problem, Reconstruction]:
         """The problem without sightings whose error is of more sigmas, and without points that are then seen once."""
-        most = max(sigmas * self.spread(given, pixel), 0.4 * pixel)
+        most = max(sigmas * self.spread(given), 0.4 * self.seen.pixel)
         good = np.linalg.norm(self.errors(given), axis=1) < most
         seen, points = self.seen.chosen(good, least=2)
-        return Problem(seen, self._cameras), replace(given, points=given.points[points])
+        return Problem(seen), replace(given, points=given.points[points])
 
     def lowest(self, start: Reconstruction, sigma: float) -> Reconstruction | None:
         """The least cost along a profile over the focal length; None where it is an end of it."""
         ends = -np.log(np.tan(np.deg2rad([_WIDEST_DEG, _NARROWEST_DEG]) / 2))
-        profile = [(float(start.lens[0]), self._cost(start, sigma), start)]
+        profile = [(self._cost(start, sigma), start)]
         for ratio in (_RATIO, 1.0 / _RATIO):
             each = start
             while ends[0] < each.lens[0] < ends[1]:
-                each, cost = self.solved(each.stretched(ratio), _BUT_FOCAL, sigma, _FEW)
-                profile.append((float(each.lens[0]), cost, each))
-                if cost > min(other for _, other, _ in profile) + _MOST_RISE:
+                each = self.solved(each.stretched(ratio), _BUT_FOCAL, sigma, _FEW)
+                cost = self._cost(each, sigma)
+                profile.append((cost, each))
+                if cost > min(other for other, _ in profile) + _MOST_RISE:
                     break
-        profile.sort(key=lambda step: step[0])
-        costs = np.array([cost for _, cost, _ in profile])
-        least = int(np.argmin(costs))
-        if least in (0, len(profile) - 1):
-            return None
-        return profile[least][2]
+        profile.sort(key=lambda step: float(step[1].lens[0]))
+        least = int(np.argmin([cost for cost, _ in profile]))
+        return profile[least][1] if 0 < least < len(profile) - 1 else None
 
     def solved(
         self, start: Reconstruction, first: int, sigma: float, iterations: int
-    ) -> tuple[Reconstruction, float]:
-        """Levenberg-Marquardt with the lens free from its ``first`` value on; also the robust cost."""
+    ) -> Reconstruction:
+        """Levenberg-Marquardt with the lens free from its ``first`` value on."""
         cost, damping = self._cost(start, sigma), _FIRST_DAMPING
         for _ in range(iterations):
             system = self._system(start, first, sigma)
@@ -283,7 +303,7 @@ class Problem:
             damping = max(0.1 * damping, _LEAST_DAMPING)
             if gain < _LEAST_GAIN:
                 break
-        return start, cost
+        return start
 
     def lens_sigmas(self, given: Reconstruction, first: int, sigma: float) -> FloatArray:
         """Formal sigmas of the lens ``(5,)``, with its values free from the ``first`` on, infinite before."""
@@ -307,7 +327,8 @@ class Problem:
 
     def _system(self, given: Reconstruction, first: int, sigma: float) -> _System:
         """Normal equations of cameras but the first and the lens, of points, and between them."""
-        seen, n = self.seen, 6 * (self._cameras - 1)
+        seen, cameras = self.seen, len(given.T_camera_world)
+        n = 6 * (cameras - 1)
         ideal, X = self._ideal(given)
         image, by_ideal, by_lens = _bent(ideal, given.lens)
         weights = 1.0 / (1.0 + self._squares(given, sigma) / _CAUCHY) / sigma**2
@@ -321,14 +342,14 @@ class Problem:
         )
         normal = (J * weights[:, None, None]).transpose(0, 2, 1) @ J
         of_points = _sums(normal[:, :4], seen.point, len(given.points))
-        of_cameras = _sums(normal[:, 4:], seen.keyframe, self._cameras)
+        of_cameras = _sums(normal[:, 4:], seen.keyframe, cameras)
         lens, prior = of_cameras[:, 6:-1].sum(axis=0), np.diag(_PRIOR_SIGMAS[first:] ** -2)
         own = block_diag(*of_cameras[1:, :6, 4:10], lens[:, 10:-1] + prior)
         own[:n, n:] = of_cameras[1:, :6, 10:-1].reshape(n, -1)
         own[n:, :n] = own[:n, n:].T
         from_prior = prior @ (given.lens - _PRIOR)[first:]
         side = np.append(of_cameras[1:, :6, -1], lens[:, -1] + from_prior)
-        W = np.zeros((len(given.points), 4, self._cameras, 6))
+        W = np.zeros((len(given.points), 4, cameras, 6))
         W[seen.point, :, seen.keyframe] = normal[:, :4, 4:10]
         W = np.dstack([W[:, :, 1:].reshape(len(W), 4, n), of_points[:, :, 10:-1]])
         V, length = of_points[:, :, :4], given.points[:, :, None] * given.points[:, None]
@@ -344,7 +365,7 @@ class Problem:
         except (LinAlgError, ValueError):
             return start
         by_point = -np.einsum("pij,pj->pi", inverse, system.point_side + system.W @ step)
-        n = 6 * (self._cameras - 1)
+        n = 6 * (len(start.T_camera_world) - 1)
         moves = step[:n].reshape(-1, 6)
         T, lens = start.T_camera_world.copy(), start.lens.copy()
         T[1:] = compose(from_rotation_vector(moves[:, :3], moves[:, 3:]), T[1:])
@@ -373,7 +394,7 @@ def _reduced(system: _System, damping: float) -> tuple[FloatArray, FloatArray, F
     return own - with_points.T @ W, side, np.asarray(inverse)
 
 
-def _turning(seen: FollowedCorners, pixel: float) -> tuple[Problem, Reconstruction] | None:
+def _turning(seen: FollowedCorners) -> tuple[Problem, Reconstruction] | None:
     """A start by the usual lens: keyframes turn on the spot, as far as they share corners, and points are far."""
     rays = np.column_stack([seen.image * np.exp(-_PRIOR[0]), np.ones(len(seen))])
     R = [np.eye(3)]
@@ -392,9 +413,9 @@ def _turning(seen: FollowedCorners, pixel: float) -> tuple[Problem, Reconstructi
     far = _normalised(np.column_stack([directions, np.full(len(points), _NEARNESS)]))
     places = _APART * np.random.default_rng(0).normal(size=(len(R), 3))
     start = Reconstruction(make(R_camera_world, places), far, _PRIOR)
-    problem = Problem(part, len(R))
+    problem = Problem(part)
     for sigma in _FIRST_SIGMAS_PX:
-        start, _ = problem.solved(start, _NOTHING, sigma * pixel, _MANY)
+        start = problem.solved(start, _NOTHING, sigma * seen.pixel, _MANY)
     return problem, start
 
 

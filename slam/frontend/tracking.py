@@ -49,8 +49,7 @@ class Search(NamedTuple):
     ``limits`` are most iterations, and the shift in pixels below which they end. A corner is kept
     if a search ``back`` returns to within ``error_px`` by a ``norm`` of this order. That has its
     own levels and limits and begins where corners came from; without them it is the same search,
-    and begins where they were found. Windows whose gradients have a smaller least eigenvalue than
-    ``texture`` are not sought.
+    and begins where they were found.
     """
 
     side: int
@@ -59,7 +58,6 @@ class Search(NamedTuple):
     back: tuple[int, tuple[int, float]] | None
     error_px: float
     norm: float
-    texture: float = _LEAST_TEXTURE
 
 
 class Texture(NamedTuple):
@@ -97,13 +95,11 @@ def track(
     """
     guesses = pixels if guesses is None else guesses
     moved, forward = _lucas_kanade(
-        first, second, pixels, guesses, search.side, search.levels, search.limits, search.texture
+        first, second, pixels, guesses, search.side, search.levels, search.limits
     )
     levels, limits = search.back or (search.levels, search.limits)
     start = moved if search.back is None else pixels
-    returned, backward = _lucas_kanade(
-        second, first, moved, start, search.side, levels, limits, search.texture
-    )
+    returned, backward = _lucas_kanade(second, first, moved, start, search.side, levels, limits)
     near = np.linalg.norm(returned - pixels, search.norm, axis=1) < search.error_px
     return moved, forward & backward & near
 
@@ -116,7 +112,6 @@ def _lucas_kanade(
     side: int,
     levels: int,
     limits: tuple[int, float],
-    texture: float = _LEAST_TEXTURE,
 ) -> tuple[Pixels, NDArray[np.bool_]]:
     if not len(pixels):
         return pixels, np.zeros(0, np.bool_)
@@ -129,7 +124,7 @@ def _lucas_kanade(
         maxLevel=levels,
         criteria=(_TERMINATION, *limits),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        minEigThreshold=texture,
+        minEigThreshold=_LEAST_TEXTURE,
     )
     return moved.reshape(-1, 2), status.ravel().astype(bool)
 

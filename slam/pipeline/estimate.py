@@ -22,7 +22,7 @@ from slam.frontend.drive import Drive
 from slam.frontend.gps import Location
 from slam.frontend.lidar_odometry import LidarPath
 from slam.frontend.scale import Scale
-from slam.frontend.visual.self_calibration import DepthError
+from slam.frontend.visual.depth_error import DepthError
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures

@@ -14,7 +14,7 @@ import numpy as np
 
 from erfsfm.common.errors import OneLineError, explained, shows_traceback
 from slam.config.sections import SlamConfig
-from slam.frames import DepthMap, Frame, Intrinsics, Mask, Predictor, SnippetPoses, resized_mask
+from slam.frames import DepthMap, Frame, Intrinsics, Predictor, SnippetPoses, resized_mask
 from slam.frontend.fixed_mask import FixedMask
 from slam.frontend.front_end import MotionTracker
 from slam.frontend.ground_plane import GroundPlaneFitter
@@ -89,8 +89,6 @@ class Observer:
         self.measured = Measured()  # so far
         self.gate = ImageGate()
         self.fixed = FixedMask()
-        self._last_found: Mask | None = None  # and, joined with the mask that was given:
-        self._last_joined: Mask | None = None
         self.tracker = MotionTracker(
             config,
             intrinsics,
@@ -144,7 +142,8 @@ class Observer:
             self._leave_out(index, str(frame))
             return
         self._unread = 0
-        frame = replace(frame, fixed=self._joined(frame.fixed))
+        given, found = frame.fixed, self.fixed.mask
+        frame = replace(frame, fixed=given if found is None else found)
         self.measured.fixed = frame.fixed
         with self._stopwatch.stage("read"):
             verdict: Verdict = self.gate.check(frame) if self._config.gaps.enabled else "new"
@@ -152,7 +151,7 @@ class Observer:
             self._leave_out(index, verdict.reason)
             return
         if verdict == "new":
-            self.fixed.follow(frame.grey)
+            self.fixed.follow(frame.grey, given)
         asked = self._ask_networks(frame)
         try:
             self._measure_pending()
@@ -178,16 +177,6 @@ class Observer:
     def frames(self) -> int:
         """Number of frames so far."""
         return len(self.measured) + (self._pending is not None)
-
-    def _joined(self, given: Mask | None) -> Mask | None:
-        """What is found to be fixed to the camera, and the ``given`` ``(H, W)``; one object while it is the same."""
-        found = self.fixed.mask
-        if given is None or found is None:
-            return found if given is None else given
-        if found is not self._last_found:
-            self._last_found = found
-            self._last_joined = given | resized_mask(found, *given.shape[::-1])
-        return self._last_joined
 
     def _is_gap(self, frames: int) -> bool:
         """Whether so many frames in a row may be without a measurement."""

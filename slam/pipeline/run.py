@@ -405,7 +405,7 @@ def look_ahead(sequence: FrameSequence, fixed: FixedMask) -> None:
     for index in np.unique(np.linspace(0, last, _IMAGES_AHEAD).astype(int)).tolist():
         frame = read_frame(sequence, index)
         if isinstance(frame, Frame):
-            fixed.look_at(frame.grey)
+            fixed.look_at(frame.grey, frame.fixed)
 
 
 def read_frame(sequence: FrameSequence, index: int) -> Frame | SequenceError:

@@ -10,6 +10,7 @@ from erfsfm.common.readers.camera_file import CAMERA_FILE
 from slam.runtime.errors import SlamError
 
 CONFIG = "config.yaml"
+MASK = "mask.png"
 METRICS = "metrics.json"
 GRAPH = "graph.g2o"
 LOOPS = "loops.json"
@@ -38,7 +39,8 @@ ESTIMATE = trajectory_file("optimised", "tum")  # a folder that holds it holds a
 
 MEANINGS = {
     CONFIG: "resolved configuration",
-    CAMERA_FILE: "camera without a calibration, as found",
+    CAMERA_FILE: "camera as found, or with the mask that was found, for a next run",
+    MASK: "what is fixed to the camera, black",
     METRICS: "every number of this page",
     GRAPH: "pose graph",
     LOOPS: "accepted and rejected loops",

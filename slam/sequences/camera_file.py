@@ -18,6 +18,7 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
+import yaml
 
 from erfsfm.common.config_tree import parse_yaml
 from erfsfm.common.errors import DataError, ErfsfmError
@@ -34,6 +35,7 @@ from erfsfm.common.readers.images import read_image
 from slam.frames import DepthMap, Image, Intrinsics, Mask, sampled_depth
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import MissingCameraError, SequenceError
+from slam.runtime.files import MASK, write_atomically
 from slam.sequences.images import Sized
 
 logger = logging.getLogger(__name__)
@@ -46,6 +48,7 @@ _ORB_COEFFICIENT = re.compile(r"Camera1?\.[kp]\d")
 _FOV_LIMITS_DEG = (3.0, 150.0)
 
 _OF_THE_MOUNTING = ("camera_height_m", "readout_ms", "mask")  # which no calibration knows
+_GAPS = np.ones((3, 3), np.uint8)
 _BLACK = 128  # grey levels of a mask below which a pixel shows what is fixed to the camera
 
 Keys = dict[str, Any]
@@ -354,7 +357,8 @@ class Undistortion:
     """
 
     def __init__(self, camera: CameraFile) -> None:
-        self._K = Intrinsics.of(camera.pinhole).K
+        pinhole = Intrinsics.of(camera.pinhole)
+        self._K = pinhole.K
         self._coefficients = np.asarray(camera.distortion, dtype=np.float64)
         self._model = camera.model
         zoom = self._shortest_zoom(camera.width, camera.height)
@@ -363,17 +367,8 @@ class Undistortion:
         if zoom > _UNLIKELY_ZOOM:
             text = "distortion %s leaves only the middle %.0f %% of the image's width: %s"
             logger.warning(text, list(camera.distortion), 100 / zoom, _CHECK)
-        focal = zoom * camera.fx, zoom * camera.fy
-        readout_s = camera.readout_ms / 1e3
-        self.intrinsics = Intrinsics(
-            camera.width,
-            camera.height,
-            *focal,
-            camera.cx,
-            camera.cy,
-            undistorted=True,
-            focal_sigma=camera.fx_sigma,
-            readout_s=readout_s,
+        self.intrinsics = replace(
+            pinhole, fx=zoom * camera.fx, fy=zoom * camera.fy, undistorted=True
         )
         pixels = self.intrinsics.pixel_grid()
         seen = (
@@ -403,6 +398,14 @@ class Undistortion:
     def apply_to_depth(self, depth: DepthMap) -> DepthMap:
         """Undistort z-depth ``(H, W)`` of an image, not positive or not finite where unknown."""
         return sampled_depth(depth, *self._maps)
+
+    def as_stored(self, mask: Mask) -> Mask:
+        """A mask ``(H, W)`` of undistorted images as one of the images as they are stored."""
+        stored = np.zeros(mask.shape, np.uint8)
+        u, v = (np.rint(each[mask]).astype(int) for each in self._maps)
+        stored[v, u] = 1
+        # where the lens magnifies, rows and columns are passed over
+        return np.asarray(cv2.dilate(stored, _GAPS), np.bool_)
 
     def distort(self, pixels: FloatArray, K: FloatArray) -> FloatArray:
         """Distorted pixels of the ``pixels`` ``(N, 2)`` of a pinhole ``K`` ``(3, 3)``."""
@@ -479,12 +482,23 @@ def require_size(images: Sized, camera: CameraFile, where: str) -> None:
 
 def undistorted(camera: CameraFile) -> tuple[Intrinsics, Undistortion | None]:
     """The camera of images after their distortion is taken out, and what takes it out; None where there is none."""
-    if camera.is_distorted:
-        undistortion = Undistortion(camera)
-        return undistortion.intrinsics, undistortion
-    pinhole = Intrinsics.of(camera.pinhole)
-    readout_s = camera.readout_ms / 1e3
-    return replace(pinhole, readout_s=readout_s, focal_sigma=camera.fx_sigma), None
+    lens = Undistortion(camera) if camera.is_distorted else None
+    pinhole = Intrinsics.of(camera.pinhole) if lens is None else lens.intrinsics
+    return replace(pinhole, readout_s=camera.readout_ms / 1e3, focal_sigma=camera.fx_sigma), lens
+
+
+def write_camera(folder: Path, camera: CameraFile, fixed: Mask | None) -> None:
+    """Write a ``camera.yaml``, and beside it the mask of what is ``fixed`` ``(H, W)`` to the camera, if anything is.
+
+    Raises:
+        SequenceError: the disk is full, or the folder is not writable.
+    """
+    if fixed is not None:
+        image = cv2.imencode(".png", np.uint8(255) * ~fixed)[1].tobytes()
+        write_atomically(folder / MASK, image, SequenceError)
+        camera = camera.model_copy(update={"mask": MASK})
+    text = yaml.safe_dump(camera.model_dump(mode="json"), sort_keys=False, width=1000)
+    write_atomically(folder / CAMERA_FILE, text, SequenceError)
 
 
 def fixed_to(camera: CameraFile, undistortion: Undistortion | None) -> Mask | None:

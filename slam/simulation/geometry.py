@@ -1,8 +1,7 @@
 """Triangle meshes with materials, and the terrain that the streets of a plan are bent onto."""
 
 from dataclasses import dataclass, replace
-from enum import IntEnum
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +12,38 @@ IntArray = NDArray[np.int64]
 
 PARAMETERS = 6  # of a texture
 
-Material = IntEnum(  # of a surface; selects its texture
-    "Material",
-    "ASPHALT JUNCTION PAVEMENT KERB GRASS GRAVEL WALL ROOF BARK LEAVES METAL SIGN PAINT GLASS "
-    "TYRE FENCE PLASTER TILES BOARDS CARPET WOOD FABRIC BOOKS PICTURE SCREEN PANE CARTON LAMP",
-    start=0,
-)
+# of a surface; selects its texture
+Material = Literal[
+    "asphalt",
+    "junction",
+    "pavement",
+    "kerb",
+    "grass",
+    "gravel",
+    "wall",
+    "roof",
+    "bark",
+    "leaves",
+    "metal",
+    "sign",
+    "paint",
+    "glass",
+    "tyre",
+    "fence",
+    "plaster",
+    "tiles",
+    "boards",
+    "carpet",
+    "wood",
+    "fabric",
+    "books",
+    "picture",
+    "screen",
+    "pane",
+    "carton",
+    "lamp",
+]
+MATERIALS: tuple[Material, ...] = get_args(Material)
 
 
 @dataclass(frozen=True)
@@ -35,7 +60,7 @@ class Mesh:
     normals: Float32Array  # unit normals, (3, T)
     tangents: Float32Array  # unit direction in which u grows, (3, T)
     instance: NDArray[np.int32]  # index into the tables below, (T,)
-    material: NDArray[np.int8]  # of each triangle, (T,)
+    material: NDArray[np.int8]  # of each triangle, a row of MATERIALS, (T,)
     colours: Float32Array  # two base colours per instance, RGB in [0, 1], (2, 3, I)
     parameters: Float32Array  # of the material's texture, (PARAMETERS, I)
     offsets: Float32Array  # of an instance in the noise texture, (2, I)
@@ -117,3 +142,13 @@ def road_bend(
 def interpolated(at: FloatArray, known: NDArray[Any], rows: FloatArray) -> FloatArray:
     """Rows ``(M, C)`` of increasing places ``(M,)`` at other places ``(N,)``, ``(N, C)``."""
     return np.stack([np.interp(at, known, column) for column in rows.T], axis=-1)
+
+
+def unit(rows: FloatArray) -> FloatArray:
+    """Directions of vectors ``(N, 3)`` or ``(N, 2)``; those of no length stay as they are."""
+    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9))
+
+
+def luck(seed: int, *draw: int) -> np.random.Generator:
+    """The random numbers of one draw of a world: others do not change with them."""
+    return np.random.default_rng([seed, *draw])

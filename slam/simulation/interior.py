@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.simulation.furniture import STANDING, TALL, Piece, dining
-from slam.simulation.geometry import FLAT, FloatArray, Material
-from slam.simulation.shapes import UP, Rectangle, Site
+from slam.simulation.geometry import FLAT, FloatArray, luck
+from slam.simulation.shapes import UP, Rectangle, Site, lattice
 
 WALL = 0.14  # thickness, metres
 KINDS = ("living", "kitchen", "office", "bedroom", "bath", "office")
@@ -71,7 +71,7 @@ class House:
 
 def draw_house(seed: int) -> House:
     """The plan of a world."""
-    rng = np.random.default_rng([seed, 50])
+    rng = luck(seed, 50)
     length, width, height = rng.uniform((14.0, 1.9, 2.45), (20.0, 2.4, 2.9)).tolist()
     corridor = Room("corridor", (0.0, 0.0, length, width), height, (3,))
     wide, deep = rng.uniform(9.0, 13.0), rng.uniform(7.5, 10.0)
@@ -111,11 +111,11 @@ class Interior:
 
     def __init__(self, seed: int) -> None:
         """The house of a world."""
-        self.rng = rng = np.random.default_rng([seed, 51])
+        self.rng = rng = luck(seed, 51)
         self.house, self.site = draw_house(seed), Site(rng)
         self.obstacles: list[Rectangle] = []
         self._lights: list[tuple[float, float, float, float]] = []
-        self.frame_look = self.site.instance(Material.WOOD, "wood")
+        self.frame_look = self.site.instance("wood", "wood")
         self.skirting = self.site.colour("skirting")
         for room in self.house.rooms:
             self._enclose_and_fill(room)
@@ -129,21 +129,21 @@ class Interior:
         east, north = np.array([x1 - x0, 0.0, 0.0]), np.array([0.0, y1 - y0, 0.0])
         if room.kind in ("living", "bedroom", "office"):
             tone = site.colour("wood")
-            floor = site.instance(Material.BOARDS, tone, 1.0, (rng.uniform(0.07, 0.16),))
+            floor = site.instance("boards", tone, 1.0, (rng.uniform(0.07, 0.16),))
         else:
             side = rng.uniform(0.9, 1.3) if room.kind == "hall" else rng.uniform(0.2, 0.5)
             tone = site.colour("floor tiles")
             chequered = room.kind in ("bath", "kitchen") and rng.random() < 0.4
-            floor = site.instance(Material.TILES, tone, 0.75, (side, 0.008, chequered))
+            floor = site.instance("tiles", tone, 0.75, (side, 0.008, chequered))
         self._panel(np.array([x0, y0, 0.0]), east, north, floor)
-        ceiling = site.instance(Material.PLASTER, "ceiling")
+        ceiling = site.instance("plaster", "ceiling")
         self._panel(np.array([x0, y0, room.height]), north, east, ceiling)
         tone = site.colour("wall")
         if room.kind == "bath":
-            wall = site.instance(Material.TILES, tone, 0.8, (rng.uniform(0.1, 0.25), 0.006))
+            wall = site.instance("tiles", tone, 0.8, (rng.uniform(0.1, 0.25), 0.006))
         else:
             papered = rng.uniform(0.1, 0.3) if rng.random() < 0.2 else 0.0
-            wall = site.instance(Material.PLASTER, tone, self.skirting, (0.08, papered, 0.08))
+            wall = site.instance("plaster", tone, self.skirting, (0.08, papered, 0.08))
         for number in range(4):
             self._furnish(room, number, wall)
         self._fill_middle(room)
@@ -171,8 +171,8 @@ class Interior:
             np.linspace(0.0, 1.0, int(np.ceil(extent / _STEP)) + 1) for extent in (width, height)
         )
         points = corner + a[None, :, None] * along + b[:, None, None] * up
-        u, v = np.meshgrid(a * width, b * height + corner[2] * (up[2] > 0.0))
-        self.site.patch(points, np.stack([u, v], axis=2), look)
+        uv = lattice(a * width, b * height + corner[2] * (up[2] > 0.0))
+        self.site.patch(points, uv, look)
 
     def _furnish(self, room: Room, number: int, wall: int) -> None:
         """One wall around its doors, seen from inside, with windows, furniture and pictures."""
@@ -189,7 +189,7 @@ class Interior:
         pieces = STANDING[room.kind]
         left = 0.7
         while True:
-            piece, width, depth = pieces[rng.integers(len(pieces))]
+            piece, width = pieces[rng.integers(len(pieces))]
             width = min(width, length - 0.05 - left)
             if width < 0.6:
                 return
@@ -201,13 +201,13 @@ class Interior:
             place = foot.moved(left, 0.01)
             stands = rng.random() < density and not (daylight and piece in TALL)
             if stands:
-                self._place(piece, place, width, depth)
+                self._place(piece, place, width)
             if not daylight and not (stands and piece in TALL) and rng.random() < 0.6:
                 self._hang(place, width)
             left += width + rng.uniform(0.05, 0.5)
 
-    def _place(self, piece: Piece, place: Site, width: float, depth: float) -> None:
-        piece(place, width)
+    def _place(self, piece: Piece, place: Site, width: float) -> None:
+        depth = piece(place, width)
         corners = np.stack([place.origin, place.moved(width).moved(0.0, depth).origin])
         self.obstacles.append((*corners.min(axis=0)[:2], *corners.max(axis=0)[:2]))
 
@@ -219,12 +219,12 @@ class Interior:
         kind = rng.random()
         if kind < 0.75:
             size = across, high, float(rng.integers(3))
-            look = place.instance(Material.PICTURE, first, second, size)
+            look = place.instance("picture", first, second, size)
         elif kind < 0.9:
-            look = place.instance(Material.SCREEN, first, second, (across, high))
+            look = place.instance("screen", first, second, (across, high))
         else:
             mirror = (0.72, 0.76, 0.78)
-            look = place.instance(Material.PANE, mirror, self.skirting, (across, high))
+            look = place.instance("pane", mirror, self.skirting, (across, high))
         left = rng.uniform(0.0, width - across)
         low = (left, 0.0, 1.6 - 0.5 * high + rng.uniform(-0.1, 0.15))
         place.plate(low, (across, 0.02, high), look, self.frame_look)
@@ -241,7 +241,7 @@ class Interior:
         place = self.site.at(x, y, angle)
         while left + width < length - 0.1:
             sky = np.array([0.86, 0.92, 0.98]) * rng.uniform(0.9, 1.05)
-            pane = place.instance(Material.PANE, sky, self.skirting, (width, high, 1.0))
+            pane = place.instance("pane", sky, self.skirting, (width, high, 1.0))
             place.plate((left, 0.0, low), (width, 0.01, high), pane, self.frame_look)
             x_light, y_light, _ = place.moved(left + 0.5 * width).moved(0.0, 0.8).origin
             strength = (0.35 if room.kind == "hall" else 0.7) * width * high
@@ -254,21 +254,22 @@ class Interior:
         """A table or a carpet; rows of racks in the hall."""
         rng, (x0, y0, x1, y1) = self.rng, room.area
         low = np.array([x0, y0]) + _DEEPEST + _AISLE
-        free = np.array([x1, y1]) - _DEEPEST - _AISLE - low
+        high = np.array([x1, y1]) - _DEEPEST - _AISLE
+        free = high - low
         if room.kind == "hall":
             for y in np.arange(low[1], low[1] + free[1] - 0.5, 0.6 + 1.5):
                 left = low[0]
-                while left < x1 - _DEEPEST - _AISLE - 1.0:
-                    piece, width, depth = STANDING["hall"][rng.integers(3)]
-                    width = min(width, x1 - _DEEPEST - _AISLE - left)
-                    self._place(piece, self.site.at(left, y), width, depth)
+                while left < high[0] - 1.0:
+                    piece, width = STANDING["hall"][rng.integers(3)]
+                    width = min(width, high[0] - left)
+                    self._place(piece, self.site.at(left, y), width)
                     left += width + rng.choice([0.05, 1.3], p=[0.6, 0.4])
             return
         if room.kind in ("living", "bedroom", "office") and free.min() > 0.2:
             size = np.minimum(free + 1.0, 2.6)
             tones = self.site.colour("cloth"), self.site.colour("paint")
             motif = rng.uniform(0.2, 0.5)
-            carpet = self.site.instance(Material.CARPET, *tones, (*size, motif))
+            carpet = self.site.instance("carpet", *tones, (*size, motif))
             corner = np.array([*(low + 0.5 * (free - size)), 0.01])
             self.site.quad(corner, np.array([size[0], 0, 0]), np.array([0, size[1], 0]), carpet)
         if free[0] > 0.8 and free[1] > 1.2 and rng.random() < 0.8:
@@ -280,7 +281,7 @@ class Interior:
     def _lamps(self, room: Room) -> None:
         """Flat lamps below the ceiling, about 3 m apart."""
         rng, (x0, y0, x1, y1) = self.rng, room.area
-        bulb = self.site.instance(Material.LAMP, (1.0, 0.98, 0.92))
+        bulb = self.site.instance("lamp", (1.0, 0.98, 0.92))
         strength = (0.8 if room.kind == "hall" else 1.0) * rng.uniform(0.8, 1.2)
         across, along = (max(1, round(extent / 3.4)) for extent in (x1 - x0, y1 - y0))
         for x in x0 + (np.arange(across) + 0.5) / across * (x1 - x0):

@@ -5,7 +5,7 @@ import functools
 import numpy as np
 
 from slam.runtime.imports import import_open3d
-from slam.simulation.geometry import Float32Array, FloatArray, IntArray
+from slam.simulation.geometry import MATERIALS, Float32Array, FloatArray, IntArray, luck, unit
 from slam.simulation.interior import interior_of
 from slam.simulation.room_textures import GLOWING
 from slam.simulation.world import Surface
@@ -26,9 +26,7 @@ def irradiance_of(seed: int, some_are_dim: bool) -> Float32Array:
     interior = interior_of(seed)
     lights = interior.lights.copy()
     if some_are_dim:
-        strength = np.exp(
-            np.random.default_rng([seed, 54]).uniform(-1.5, 0.5, len(interior.house.rooms))
-        )
+        strength = np.exp(luck(seed, 54).uniform(-1.5, 0.5, len(interior.house.rooms)))
         for room, factor in zip(interior.house.rooms, strength):
             lights[room.contains(lights[:, :2]), 3] *= factor
     surface, mesh = Surface(interior.mesh), interior.mesh
@@ -39,7 +37,7 @@ def irradiance_of(seed: int, some_are_dim: bool) -> Float32Array:
     for corner in triangles.T:
         np.add.at(middle, corner, mesh.vertices[triangles].mean(axis=1))
         np.add.at(normal, corner, mesh.normals.T)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    normal = unit(normal)
     middle /= np.maximum(uses, 1)
     # out of the corner, off the surface
     points = mesh.vertices + 0.12 * (middle - mesh.vertices) + 0.015 * normal
@@ -56,7 +54,7 @@ def irradiance_of(seed: int, some_are_dim: bool) -> Float32Array:
         fade = strength * cosine[near] / (1.0 + 0.35 * distance[near] ** 2)
         direct[near] += np.where(blocked, 0.0, fade)
     hit = _around(surface, points, normal)
-    shining = np.isin(mesh.material, [int(material) for material in GLOWING])
+    shining = np.isin(mesh.material, [MATERIALS.index(material) for material in GLOWING])
     total = direct
     for _ in range(_BOUNCES):
         thrown = np.where(shining, 1.2, _ALBEDO * total[triangles].mean(axis=1))
@@ -74,7 +72,7 @@ def _around(surface: Surface, points: FloatArray, normals: FloatArray) -> IntArr
     radius = np.sqrt((np.arange(_RAYS) + 0.5) / _RAYS)
     helper = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     side = np.cross(normals, helper)
-    side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
+    side = unit(side)
     other = np.cross(normals, side)
     found = np.empty((_RAYS, len(points)), dtype=np.int64)
     for k, (angle, r) in enumerate(zip(turn, radius)):

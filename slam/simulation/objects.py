@@ -4,8 +4,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from slam.simulation.geometry import FloatArray, Material
-from slam.simulation.shapes import UP, Site
+from slam.simulation.geometry import FloatArray
+from slam.simulation.shapes import UP, Site, lattice
 
 
 def building(site: Site, width: float, depth: float) -> None:
@@ -19,8 +19,8 @@ def building(site: Site, width: float, depth: float) -> None:
     trim = site.colour("window frame")
     style = rng.choice(3, p=[0.45, 0.35, 0.2])  # plaster, brick, boards
     look = (floor, spacing, window_width, rng.uniform(1.1, 1.7), style, height)
-    wall = site.instance(Material.WALL, plaster, trim, look)
-    roof = site.instance(Material.ROOF, "roof")
+    wall = site.instance("wall", plaster, trim, look)
+    roof = site.instance("roof", "roof")
     site.box(np.zeros(3), (width, depth, height), wall, roof)
     if rng.random() < 0.65:
         _gable(site, (width, depth, height), wall, roof)
@@ -31,9 +31,7 @@ def building(site: Site, width: float, depth: float) -> None:
         site.box((x, -0.9, 0.0), (x + w, 0.0, top), wall, roof)
     if rng.random() < 0.5:  # a chimney
         x, y = rng.uniform(0.2, 0.8) * width, rng.uniform(0.3, 0.7) * depth
-        stone = site.instance(
-            Material.WALL, 0.8 * plaster, trim, (99.0, 99.0, 0.0, 0.0, 1.0, height)
-        )
+        stone = site.instance("wall", 0.8 * plaster, trim, (99.0, 99.0, 0.0, 0.0, 1.0, height))
         site.box((x, y, height), (x + 0.8, y + 0.8, height + 3.0), stone)
 
 
@@ -63,9 +61,9 @@ def _gable(site: Site, size: tuple[float, float, float], wall: int, roof: int) -
 def tree(site: Site, size: float) -> None:
     """A trunk with a crown of lumpy balls, or a conifer of stacked cones."""
     rng, foot = site.rng, site.origin
-    bark = site.instance(Material.BARK, "bark")
+    bark = site.instance("bark", "bark")
     green = site.colour("tree")
-    leaves = site.instance(Material.LEAVES, green, green * rng.uniform(0.35, 0.6))
+    leaves = site.instance("leaves", green, green * rng.uniform(0.35, 0.6))
     trunk = size * rng.uniform(0.28, 0.42)
     lean = np.array([*rng.normal(0.0, 0.04, 2), 1.0])
     site.tube(foot, foot + lean * (trunk + 0.25 * size), (0.035 * size, 0.02 * size), bark)
@@ -83,49 +81,47 @@ def hedge(site: Site, length: float) -> None:
     """A hedge, a fence or a low wall along the place's x axis."""
     kind, height = site.rng.random(), site.rng.uniform(0.8, 1.7)
     if kind < 0.5:
-        look, thick = site.instance(Material.LEAVES, "hedge", 0.5), 0.6
+        look, thick = site.instance("leaves", "hedge", 0.5), 0.6
     elif kind < 0.8:
         wood = site.colour("fence")
         gap = site.rng.uniform(0.14, 0.3)
-        look, thick = site.instance(Material.FENCE, wood, 0.35, (gap, height)), 0.06
+        look, thick = site.instance("fence", wood, 0.35, (gap, height)), 0.06
     else:
         plain = (99.0, 99.0, 0.0, 0.0, 1.0, height)  # without windows
-        look = site.instance(Material.WALL, "garden wall", 1.0, plain)
+        look = site.instance("wall", "garden wall", 1.0, plain)
         thick = 0.3
     site.box(np.zeros(3), (length, thick, height), look)
 
 
 def lamp(site: Site, towards: FloatArray) -> None:
     """A street lamp whose arm reaches ``towards`` the road, a plan direction ``(2,)``."""
-    steel = site.instance(Material.METAL, "street lamp")
-    top = site.origin + site.rng.uniform(5.0, 8.0) * UP
-    site.tube(site.origin, top, (0.10, 0.06), steel)
+    steel = site.instance("metal", "street lamp")
+    top = site.pole(site.rng.uniform(5.0, 8.0), (0.10, 0.06), steel)
     reach = np.array([*towards, 0.12])
     site.tube(top, top + reach * site.rng.uniform(0.9, 1.8), (0.05, 0.09), steel)
 
 
 def sign(site: Site) -> None:
     """A traffic sign on a post; its plate faces traffic that drives along the place's y axis."""
-    steel = site.instance(Material.METAL, "sign post")
+    steel = site.instance("metal", "sign post")
     height = site.rng.uniform(2.1, 2.7)
-    site.tube(site.origin, site.origin + (height + 0.3) * UP, (0.04, 0.04), steel)
+    site.pole(height + 0.3, (0.04, 0.04), steel)
     paint = site.colour("sign")
     half = site.rng.uniform(0.3, 0.45)
     kind = float(site.rng.integers(3))
-    plate = site.instance(Material.SIGN, paint, (0.92, 0.92, 0.90), (half, kind))
+    plate = site.instance("sign", paint, (0.92, 0.92, 0.90), (half, kind))
     site.moved(-half, -0.06, height).box(np.zeros(3), (2 * half, 0.02, 2 * half), plate)
 
 
 def railing(site: Site, length: float) -> None:
     """Posts and bars along the place's x axis, which one sees through."""
     rng = site.rng
-    steel = site.instance(Material.METAL, "railing")
+    steel = site.instance("metal", "railing")
     height, spacing = rng.uniform(0.6, 1.3), rng.choice([0.15, 0.3, 1.5, 2.5])
     radii = (rng.uniform(0.015, 0.05),) * 2
     posts = np.arange(0.0, length, max(spacing, length / 120))
     for along in posts.tolist():
-        foot = site.moved(along).origin
-        site.tube(foot, foot + height * UP, radii, steel)
+        site.moved(along).pole(height, radii, steel)
     for level in np.linspace(1.0, 0.25, rng.integers(1, 4)):
         bar = site.origin + level * height * UP
         site.tube(bar, bar + posts[-1] * site.frame[0] + 1e-3 * site.frame[0], radii, steel)
@@ -134,8 +130,8 @@ def railing(site: Site, length: float) -> None:
 def wire_fence(site: Site, length: float) -> None:
     """Wooden posts and the wires between them along the place's x axis."""
     rng = site.rng
-    wood = site.instance(Material.BARK, "fence post")
-    wire = site.instance(Material.METAL, "wire")
+    wood = site.instance("bark", "fence post")
+    wire = site.instance("metal", "wire")
     height = rng.uniform(0.9, 1.4)
     posts = np.arange(0.0, length, rng.uniform(2.0, 4.0)).tolist()
     for along in posts:
@@ -149,32 +145,28 @@ def wire_fence(site: Site, length: float) -> None:
 
 def barrier(site: Site, length: float, concrete: bool) -> None:
     """A wall of concrete, or a steel rail on posts, along the place's x axis in pieces of 4 m."""
-    look = site.instance(Material.GRAVEL if concrete else Material.METAL, "barrier", 0.8)
+    look = site.instance("gravel" if concrete else "metal", "barrier", 0.8)
     for along in np.arange(0.0, length - 3.9, 4.0).tolist():
         place = site.moved(along)
         if concrete:
             place.box((0.0, -0.3, 0.0), (4.0, 0.3, 0.35), look)
             place.box((0.0, -0.12, 0.35), (4.0, 0.12, 0.9), look)
         else:
-            place.tube(place.origin, place.origin + 0.75 * UP, (0.06, 0.06), look)
+            place.pole(0.75, (0.06, 0.06), look)
             place.box((0.0, -0.05, 0.45), (4.0, 0.05, 0.76), look)
 
 
 def post(site: Site) -> None:
     """A bollard, a guide post or a mast."""
-    steel = site.instance(Material.METAL, "post")
+    steel = site.instance("metal", "post")
     radius = site.rng.uniform(0.03, 0.12)
-    tip = site.origin + site.rng.choice([1.0, 3.0, 7.0]) * UP
-    site.tube(site.origin, tip, (radius, 0.8 * radius), steel)
+    site.pole(site.rng.choice([1.0, 3.0, 7.0]), (radius, 0.8 * radius), steel)
 
 
 def person(site: Site) -> None:
     """Legs, body and head of somebody who stands 10 cm above the place."""
-    trousers, coat = (
-        site.instance(Material.METAL, "clothes"),
-        site.instance(Material.METAL, "clothes"),
-    )
-    skin = site.instance(Material.METAL, "skin")
+    trousers, coat = (site.instance("metal", "clothes"), site.instance("metal", "clothes"))
+    skin = site.instance("metal", "skin")
     size = site.rng.uniform(0.85, 1.08)
     foot = site.origin + 0.1 * UP
     side = 0.12 * np.array([*np.sin(site.rng.uniform(0, 7) + np.array([0, np.pi / 2])), 0.0])
@@ -197,7 +189,7 @@ def bonnet(site: Site, below: float, height_m: float) -> None:
         + 0.10 * x**2
         + 0.25 * np.clip(np.abs(x) - 0.7, 0.0, None)
     )
-    paint = site.instance(Material.METAL, "bonnet")
+    paint = site.instance("metal", "bonnet")
     site.patch(np.stack([x, y, z], axis=2), np.stack([x, z], axis=2), paint)
 
 
@@ -205,9 +197,9 @@ def car(site: Site) -> None:
     """A car centred on the place and pointing along its x axis: body, cabin and wheels."""
     rng = site.rng
     lacquer = site.colour("car")
-    paint = site.instance(Material.PAINT, lacquer, 0.4)
-    glass = site.instance(Material.GLASS, (0.10, 0.12, 0.14), 0.8 * lacquer)
-    tyre = site.instance(Material.TYRE, (0.05, 0.05, 0.05), (0.5, 0.5, 0.5))
+    paint = site.instance("paint", lacquer, 0.4)
+    glass = site.instance("glass", (0.10, 0.12, 0.14), 0.8 * lacquer)
+    tyre = site.instance("tyre", (0.05, 0.05, 0.05), (0.5, 0.5, 0.5))
     length = rng.uniform(3.7, 4.7)
     half = rng.uniform(0.82, 0.92)
     van = rng.random() < 0.2
@@ -223,8 +215,7 @@ def car(site: Site) -> None:
         ring.append([[back, -y, z], [front, -y, z], [front, y, z], [back, y, z], [back, -y, z]])
     points = np.array(ring) @ site.frame[:3] + site.origin
     corner = np.cumsum([0.0, low[1] - low[0], 2 * half, low[1] - low[0], 2 * half])
-    uv = np.stack(np.meshgrid(corner, [0.0, roof - waist]), axis=2)
-    site.patch(points, uv, glass)
+    site.patch(points, lattice(corner, (0.0, roof - waist)), glass)
     site.quad(points[1, 0], points[1, 1] - points[1, 0], points[1, 3] - points[1, 0], paint)
     angle = np.linspace(0.0, 2.0 * np.pi, 11)
     rim = np.stack([0.32 * np.cos(angle), np.zeros(11), 0.32 * np.sin(angle)], axis=1)

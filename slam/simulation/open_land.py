@@ -3,7 +3,7 @@
 import numpy as np
 
 from slam.simulation import objects
-from slam.simulation.geometry import FloatArray, Material
+from slam.simulation.geometry import FloatArray
 from slam.simulation.options import StreetKind
 from slam.simulation.route import KERB
 from slam.simulation.shapes import Rectangle, Site, corners_of, directed, grid_over
@@ -33,7 +33,7 @@ def open_land(
     points = grid_over(inner, 0.0, 2.0)
     points[..., 2] = ground(points[..., 0], points[..., 1])
     crop = site.colour("crop")
-    land = grass if rng.random() < 0.4 else site.instance(Material.GRASS, crop, 0.6)
+    land = grass if rng.random() < 0.4 else site.instance("grass", crop, 0.6)
     site.patch(points, points[..., :2], land)
     wood = rng.choice([0.0, 1.0, 4.0, 10.0])  # trees in 100 square metres near the road
     corners = corners_of(inner)
@@ -45,7 +45,7 @@ def open_land(
             x, y = start + rng.uniform(0.0, length) * ahead + far * inward
             z = float(ground(x, y))
             if rng.random() < 0.4:
-                bush = site.instance(Material.LEAVES, "bush", 0.45)
+                bush = site.instance("leaves", "bush", 0.45)
                 size = rng.uniform(0.5, 1.8)
                 site.ball(np.array([x, y, z + 0.4 * size]), (size, size, 0.8 * size), bush)
             elif far > 1.5:
@@ -60,7 +60,7 @@ def _edge(site: Site, kind: StreetKind, length: float) -> None:
         if luck < 0.75:
             objects.barrier(site, length, luck < 0.25)
         elif luck < 0.87:  # against the noise
-            wall = site.instance(Material.BOARDS, "noise wall", 0.6, (0.5,))
+            wall = site.instance("boards", "noise wall", 0.6, (0.5,))
             site.box(np.zeros(3), (length, 0.3, site.rng.uniform(2.5, 5.0)), wall)
     elif luck < 0.3:
         objects.wire_fence(site, length)

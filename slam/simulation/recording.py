@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.formats.ply import Ply, write_ply
+from slam.formats.ply import write_ply
 from slam.formats.trajectory import Trajectory, write_kitti
 from slam.runtime.errors import SequenceError
 from slam.sequences.catalogue import open_sequence
@@ -47,7 +47,7 @@ class SimulatedSequence(RecordedSequence):
 
     def __init__(self, options: SimulationOptions) -> None:
         street = self.street = simulated_world(options)
-        rendered = lru_cache(maxsize=_CACHED_FRAMES)(lambda index: street.render(index))
+        rendered = lru_cache(maxsize=_CACHED_FRAMES)(street.render)
         super().__init__(
             "sim",
             ReadImages(
@@ -59,7 +59,7 @@ class SimulatedSequence(RecordedSequence):
             street.camera,
             uniform_stamps(options.frames, options.rate),
             (Source(f"simulated/{options.seed}", first=None),),
-            T_any_camera=np.asarray(street.T_world_camera, dtype=np.float64),
+            T_any_camera=street.T_world_camera,
             usual_height_m=street.camera_height_m,
             T_camera_lidar=street.T_camera_lidar,
             depth_maps={k: partial(street.depth, k) for k in range(options.frames)},
@@ -125,11 +125,7 @@ def write_kitti_root(
             _write_frames(world, partial / "sequences" / "sim", depth, lidar, progress)
             _write_records(world, partial)
             if mesh:
-                vertices, triangles = world.mesh_world()
-                corners = np.ascontiguousarray(vertices, "<f4").view(
-                    [(axis, "<f4") for axis in "xyz"]
-                )[:, 0]
-                write_ply(partial / "mesh.ply", Ply(corners, triangles.astype(np.int64)))
+                write_ply(partial / "mesh.ply", world.mesh_world())
             partial.replace(output)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
@@ -162,12 +158,9 @@ def _write_frames(
 
 def _write_records(world: SimulatedWorld, root: Path) -> None:
     """Calibration, times, poses, the camera and what was simulated."""
-    sequence = root / "sequences" / "sim"
-    camera = world.camera
-    options = world.options
-    projection = _row(
-        np.column_stack([camera.K, np.zeros(3)])
-    )  # the one camera stands for all four
+    sequence, camera, options = root / "sequences" / "sim", world.camera, world.options
+    # the one camera stands for all four
+    projection = _row(np.column_stack([camera.K, np.zeros(3)]))
     rows = [f"P{number}: {projection}" for number in range(4)]
     if world.T_camera_lidar is not None:
         rows.append(f"Tr: {_row(world.T_camera_lidar[:3])}")
@@ -178,20 +171,16 @@ def _write_records(world: SimulatedWorld, root: Path) -> None:
     (root / "poses").mkdir()
     stamps = np.arange(len(world), dtype=np.float64)
     write_kitti(root / "poses" / "sim.txt", Trajectory(stamps, world.T_world_camera))
-    keys = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")} | {
-        "fps": options.rate
-    }
+    keys = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
+    keys["fps"] = options.rate
     if world.camera_height_m is not None:
         keys["camera_height_m"] = world.camera_height_m
     if options.readout_s:
         keys["readout_ms"] = 1e3 * options.readout_s
-    write_lines(
-        root / "camera.yaml",
-        [f"{key}: {value}" for key, value in keys.items()] + ["model: pinhole"],
-    )
-    write_lines(
-        root / "simulation.json", [json.dumps({**asdict(options), "version": VERSION}, indent=2)]
-    )
+    keys["model"] = "pinhole"
+    write_lines(root / "camera.yaml", [f"{key}: {value}" for key, value in keys.items()])
+    record = {**asdict(options), "version": VERSION}
+    write_lines(root / "simulation.json", [json.dumps(record, indent=2)])
 
 
 def write_image(path: Path, image: NDArray[np.uint8]) -> None:

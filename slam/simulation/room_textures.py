@@ -2,14 +2,15 @@
 
 import numpy as np
 
-from slam.simulation.geometry import Float32Array, Material
+from slam.simulation.geometry import Material
 from slam.simulation.texture import Lengths, Shader, Texels, cell_hash, grained, mix
 
-GLOWING = {Material.SCREEN: 1.3, Material.PANE: 2.2, Material.LAMP: 2.5}  # light of their own
+# light of their own
+GLOWING: dict[Material, float] = {"screen": 1.3, "pane": 2.2, "lamp": 2.5}
 _INK = np.array([[0.12], [0.12], [0.14]], dtype=np.float32)
 
 
-def _plaster(texels: Texels) -> Float32Array:
+def _plaster(texels: Texels) -> Lengths:
     skirting, period, contrast = texels.parameters[:3]
     grain = texels.fractal(
         (2.3, 1.9, 0.02), (0.4, 0.4, 0.012), (0.05, 0.05, 0.02), (0.015, 0.015, 0.02)
@@ -20,7 +21,7 @@ def _plaster(texels: Texels) -> Float32Array:
     return mix(rgb, texels.second * (1.0 + grain), texels.v.band(-1.0, skirting) * (skirting > 0))
 
 
-def _tiles(texels: Texels) -> Float32Array:
+def _tiles(texels: Texels) -> Lengths:
     side, joint, checks = texels.parameters[:3]
     u, v = texels.u.at / side, texels.v.at / side
     near = np.clip(side / texels.size / 2.0 - 0.5, 0.0, 1.0)
@@ -31,7 +32,7 @@ def _tiles(texels: Texels) -> Float32Array:
     return mix(rgb, texels.second, texels.joints(side, side, joint))
 
 
-def _boards(texels: Texels) -> Float32Array:
+def _boards(texels: Texels) -> Lengths:
     width = texels.parameters[0]
     row = np.floor(texels.v.at / width)
     along = np.asarray(texels.u.at + 0.9 * cell_hash(row, row, 2), dtype=np.float32)
@@ -42,7 +43,7 @@ def _boards(texels: Texels) -> Float32Array:
     return np.asarray(texels.first * (1.0 + tone + veins) * (1.0 - 0.55 * gaps))
 
 
-def _carpet(texels: Texels) -> Float32Array:
+def _carpet(texels: Texels) -> Lengths:
     width, height, motif = texels.parameters[:3]
     u, v = texels.u.at - 0.5 * width, texels.v.at - 0.5 * height
     lozenge = np.abs((u / motif) % 1.0 - 0.5) + np.abs((v / motif) % 1.0 - 0.5)
@@ -55,7 +56,7 @@ def _carpet(texels: Texels) -> Float32Array:
     return mix(texels.first, texels.second, np.maximum(figure, border)) * grain
 
 
-def _wood(texels: Texels) -> Float32Array:
+def _wood(texels: Texels) -> Lengths:
     width, height = np.where(texels.parameters[:2] > 0.0, texels.parameters[:2], 9.0)  # of a door
     veins = texels.fractal((0.03, 0.5, 0.09), (0.01, 0.25, 0.08), (0.3, 1.1, 0.1))
     gaps = texels.joints(width, height, 0.008)
@@ -64,7 +65,7 @@ def _wood(texels: Texels) -> Float32Array:
     return mix(texels.first * (1.0 + veins) * (1.0 - 0.6 * gaps), texels.second, knobs)
 
 
-def _books(texels: Texels) -> Float32Array:
+def _books(texels: Texels) -> Lengths:
     """Rows of spines of all colours between boards; the upper part of a row is dark."""
     row, shift = texels.parameters[2], texels.u.shift
     shelf = np.floor(texels.v.at / row)
@@ -85,7 +86,7 @@ def _books(texels: Texels) -> Float32Array:
     return mix(rgb, texels.first * (1.0 + texels.fractal((0.4, 0.05, 0.1))), boards)
 
 
-def _picture(texels: Texels) -> Float32Array:
+def _picture(texels: Texels) -> Lengths:
     """A painting of blots, or a poster of a picture and text, in a frame."""
     _, height, kind = texels.parameters[:3]
     blot = texels.fractal((0.31, 0.27, 1.0), (0.12, 0.11, 0.7), (0.05, 0.05, 0.4))
@@ -98,7 +99,7 @@ def _picture(texels: Texels) -> Float32Array:
     return mix(rgb, np.where(kind > 0, 0.92, 0.25 * texels.first), texels.rim(0.03))
 
 
-def _screen(texels: Texels) -> Float32Array:
+def _screen(texels: Texels) -> Lengths:
     """Windows of text on a desktop."""
     width, height = texels.parameters[:2]
     pane = (texels.u.at % (0.5 * width) > 0.03 * width) & (
@@ -108,7 +109,7 @@ def _screen(texels: Texels) -> Float32Array:
     return mix(mix(texels.second, text, pane), 0.3 * _INK, texels.rim(0.015))
 
 
-def _pane(texels: Texels) -> Float32Array:
+def _pane(texels: Texels) -> Lengths:
     """A bright window or a mirror, with a frame and a cross of bars."""
     width, height, bars = texels.parameters[:3]
     upright = texels.u.band(0.5 * width - 0.02, 0.5 * width + 0.02)
@@ -118,7 +119,7 @@ def _pane(texels: Texels) -> Float32Array:
     return mix(texels.first * sheen, texels.second, np.maximum(bar, texels.rim(0.045)))
 
 
-def _carton(texels: Texels) -> Float32Array:
+def _carton(texels: Texels) -> Lengths:
     width, height = texels.parameters[:2]
     grain = texels.fractal((0.6, 0.5, 0.07), (0.1, 0.1, 0.05), (0.015, 0.2, 0.04))
     tape = texels.v.band(0.47 * height, 0.47 * height + 0.05)
@@ -129,28 +130,28 @@ def _carton(texels: Texels) -> Float32Array:
     return mix(rgb, text, label) * (1.0 - 0.35 * texels.rim(0.008))
 
 
-def _text(texels: Texels, line: Lengths | float, letter: float) -> Float32Array:
+def _text(texels: Texels, line: Lengths | float, letter: float) -> Lengths:
     """Coverage by lines of words."""
     row = np.floor(texels.v.at / line)
     word = cell_hash(texels.u.at / letter + texels.u.shift, row + texels.v.shift, 7) > 0.35
     near = np.clip(letter / texels.size - 0.7, 0.0, 1.0)
     written = word * near + 0.65 * (1.0 - near)
-    return np.asarray(texels.v.stripes(line, 0.55 * line) * written)
+    return texels.v.stripes(line, 0.55 * line) * written
 
 
 ROOM_SHADERS: dict[Material, Shader] = {
-    Material.PLASTER: _plaster,
-    Material.TILES: _tiles,
-    Material.BOARDS: _boards,
-    Material.CARPET: _carpet,
-    Material.WOOD: _wood,
-    Material.FABRIC: grained(
+    "plaster": _plaster,
+    "tiles": _tiles,
+    "boards": _boards,
+    "carpet": _carpet,
+    "wood": _wood,
+    "fabric": grained(
         (0.6, 0.6, 0.08), (0.12, 0.12, 0.07), (0.02, 0.02, 0.12), (0.008, 0.008, 0.12)
     ),
-    Material.BOOKS: _books,
-    Material.PICTURE: _picture,
-    Material.SCREEN: _screen,
-    Material.PANE: _pane,
-    Material.CARTON: _carton,
-    Material.LAMP: grained(),
+    "books": _books,
+    "picture": _picture,
+    "screen": _screen,
+    "pane": _pane,
+    "carton": _carton,
+    "lamp": grained(),
 }

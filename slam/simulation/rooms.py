@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
 from slam.simulation.carried import Carried, Floor
-from slam.simulation.geometry import Float32Array, FloatArray, Material, Mesh
+from slam.simulation.geometry import MATERIALS, Float32Array, FloatArray, Mesh, luck
 from slam.simulation.interior import interior_of
 from slam.simulation.irradiance import irradiance_of
 from slam.simulation.objects import person
@@ -36,7 +36,7 @@ _LONGEST_S = 0.02  # exposure in the light
 _METER_S = 0.1  # the meter's period
 _METERED = 12  # how often it is read
 _METER_WEIGHTS = np.exp(-_METER_S * np.arange(_METERED) / 0.35)  # the newest reading first
-_GLOW = np.array([GLOWING.get(material, 0.0) for material in Material], dtype=np.float32)
+_GLOW = np.array([GLOWING.get(material, 0.0) for material in MATERIALS], dtype=np.float32)
 
 
 class SimulatedRooms(SimulatedWorld):
@@ -61,14 +61,12 @@ class SimulatedRooms(SimulatedWorld):
             Carried(floor, "walk", seconds, options.rate, options.seed + 1000 * k)
             for k in range(1, _PEOPLE * peopled)
         ]
-        rng = np.random.default_rng([options.seed, 57])
+        rng = luck(options.seed, 57)
         # around their own origins, looking along x
         self._people = Moving(rng, [person] * _PEOPLE) if peopled else None
         fov = options.fov_deg or _USUAL_FOV_DEG
         if options.varied and options.fov_deg is None:
-            fov = float(
-                np.exp(np.random.default_rng([options.seed, 55]).uniform(*np.log(_VARIED_FOV_DEG)))
-            )
+            fov = float(np.exp(luck(options.seed, 55).uniform(*np.log(_VARIED_FOV_DEG))))
         moments = self._moments(np.arange(options.frames) / options.rate)
         camera = square_camera(options.width, options.height, fov)
         super().__init__(options, camera, self._carried.poses(moments))
@@ -148,7 +146,7 @@ class SimulatedRooms(SimulatedWorld):
         gain = self._gain(index)
         rgb = through_lens(rgb * np.float32(gain))
         if "exposure" in self.options.hazards:
-            rng = np.random.default_rng([self.options.seed, 56, index])
+            rng = luck(self.options.seed, 56, index)
             rgb = rgb + rng.standard_normal(rgb.shape, dtype=np.float32) * np.float32(
                 0.008 * np.sqrt(gain)
             )

@@ -12,7 +12,15 @@ from scipy.ndimage import gaussian_filter1d
 
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
-from slam.simulation.geometry import Bend, FloatArray, interpolated, road_bend, town_bend
+from slam.simulation.geometry import (
+    Bend,
+    FloatArray,
+    interpolated,
+    luck,
+    road_bend,
+    town_bend,
+    unit,
+)
 from slam.simulation.options import StreetKind, Variety
 
 Node = tuple[int, int]
@@ -245,7 +253,7 @@ def plan_route(
     arrival = _arrival(bend, lane_plan, stops, moving)
     if route == "loop":
         arrival *= (moving - 1.0) / arrival[-1]
-    rng = np.random.default_rng([seed, 2])
+    rng = luck(seed, 2)
     camera_height_m = rng.uniform(1.5, 1.8) if variety is None else variety.height_m
     sample = np.interp(np.arange(moving), arrival, np.arange(len(arrival)))
     T_street_camera = _poses(rng, bend, lane_plan, sample, camera_height_m, variety)
@@ -266,17 +274,15 @@ def _layout(
     route: str, moving: int, seed: int, stops: bool, variety: Variety | None
 ) -> tuple[StreetPlan, Bend, FloatArray]:
     """Streets, their bend, and the lane to drive ``(M, 2)``, long enough for ``moving`` frames."""
-    rng = np.random.default_rng([seed, 0])
+    rng = luck(seed, 0)
     kind: StreetKind = "town" if variety is None else variety.kind
     hills = None if variety is None else (variety.steepness, variety.wavelength_m)
     if route == "straight":
         end = START + 1.25 * moving + 5.0
         plan = road_plan(rng, end, kind)
-        bend = road_bend(
-            np.random.default_rng([seed, 1]), plan.xs[0] - 200.0, plan.xs[-1] + 200.0, hills
-        )
+        bend = road_bend(luck(seed, 1), plan.xs[0] - 200.0, plan.xs[-1] + 200.0, hills)
         return plan, bend, _lane(plan, seed)[int(START / STEP) : int(end / STEP)]
-    bend = town_bend(np.random.default_rng([seed, 1]), hills)
+    bend = town_bend(luck(seed, 1), hills)
     if route == "grid":
         side = 3 if moving < 500 else 4 if moving < 1200 else 5
         spacing = (
@@ -290,7 +296,7 @@ def _layout(
     edges = max(8, 2 * round((0.95 * moving - OVERLAP) / 84.0))
     spacing = 36.0
     for _ in range(8):
-        rng = np.random.default_rng([seed, 0])
+        rng = luck(seed, 0)
         cycle = loop_cycle(rng, edges)
         plan = town_plan(rng, cycle + cycle + cycle[:1], spacing, side_streets=0.35, kind=kind)
         # around a cycle that is driven twice, cut off ``OVERLAP`` metres after its start is met
@@ -310,16 +316,16 @@ def _layout(
 
 def _lane_offset(plan: StreetPlan, seed: int) -> float:
     """How far right of the middle of the street the car drives, metres."""
-    return np.random.default_rng([seed, 4]).uniform(0.33, 0.38) * plan.half_width
+    return luck(seed, 4).uniform(0.33, 0.38) * plan.half_width
 
 
 def _lane(plan: StreetPlan, seed: int) -> FloatArray:
     """The whole driven path ``(M, 2)``: right-hand lane, rounded corners and a little drift."""
-    rng = np.random.default_rng([seed, 3])
+    rng = luck(seed, 3)
     nodes = np.stack([plan.node(node) for node in plan.drive])  # (n, 2)
     offset = _lane_offset(plan, seed)
     ahead = np.diff(nodes, axis=0)
-    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    ahead = unit(ahead)
     right = np.stack([ahead[:, 1], -ahead[:, 0]], axis=1)
     turns = ahead[:-1, 0] * ahead[1:, 1] - ahead[:-1, 1] * ahead[1:, 0]
     sideways = np.concatenate([right, right[-1:]])
@@ -331,7 +337,7 @@ def _lane(plan: StreetPlan, seed: int) -> FloatArray:
     path = _resample(np.stack([corners[0], *rounded, corners[-1]]))
     path = gaussian_filter1d(path, 1.6 / STEP, axis=0, mode="nearest")
     tangent = np.gradient(path, axis=0)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    tangent = unit(tangent)
     drift = gaussian_filter1d(rng.standard_normal(len(path)), 14.0 / STEP)
     drift *= 0.13 / max(drift.std(), 1e-9)
     path += np.clip(drift, -0.28, 0.28)[:, None] * np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
@@ -399,14 +405,14 @@ def _poses(
     rows = np.arange(len(lane_plan))
     direction = gaussian_filter1d(np.gradient(lane_plan, axis=0), 4.0, axis=0)
     tangent = interpolated(sample, rows, direction)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    tangent = unit(tangent)
     at, ahead = _level(interpolated(sample, rows, lane_plan)), _level(tangent)
     across = np.stack([tangent[:, 1], -tangent[:, 0], np.zeros(len(at))], axis=1)
     forward = bend(at + ahead) - bend(at - ahead)
     right = bend(at + across) - bend(at - across)
-    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    forward = unit(forward)
     right -= (right * forward).sum(axis=1, keepdims=True) * forward
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    right = unit(right)
     down = np.cross(forward, right)
     # suspension: pitch, yaw and roll about x, y, z in radians and height in metres, correlated in
     # time, (N, 4)

@@ -15,6 +15,7 @@ from erfsfm.common.config_tree import parse_yaml
 from erfsfm.common.files import read_text
 from slam.simulation.geometry import (
     FLAT,
+    MATERIALS,
     PARAMETERS,
     Bend,
     Float32Array,
@@ -22,6 +23,7 @@ from slam.simulation.geometry import (
     IntArray,
     Material,
     Mesh,
+    unit,
 )
 
 Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1
@@ -53,6 +55,7 @@ class Site:
     Attributes:
         rng: draws what is left open.
         frame: the place's x, y and z axis and its origin as rows, ``(4, 3)``.
+        looks: material, colours and parameters of each instance so far.
     """
 
     def __init__(self, rng: np.random.Generator) -> None:
@@ -60,18 +63,12 @@ class Site:
         self.rng, self.frame = rng, np.eye(4, 3)
         # vertices, triangles, their texture coordinates and instances, patch by patch
         self._patches: list[tuple[FloatArray, IntArray, FloatArray, IntArray]] = []
-        # material, colours and parameters, by instance
-        self._looks: list[tuple[int, FloatArray, FloatArray]] = []
+        self.looks: list[tuple[int, FloatArray, FloatArray]] = []
 
     @property
     def origin(self) -> FloatArray:
         """Where it is, ``(3,)``."""
         return np.asarray(self.frame[3])
-
-    @property
-    def instances(self) -> int:
-        """Number of registered instances."""
-        return len(self._looks)
 
     def at(self, x: float, y: float, angle: float = 0.0, z: float = 0.0) -> "Site":
         """Another place in the plan, its x axis turned by ``angle`` radians from east."""
@@ -122,8 +119,8 @@ class Site:
             second = self.colour(second)
         elif isinstance(second, float):
             second = second * colour
-        self._looks.append((int(material), np.array([colour, second]), row))
-        return len(self._looks) - 1
+        self.looks.append((MATERIALS.index(material), np.array([colour, second]), row))
+        return len(self.looks) - 1
 
     def patch(self, points: FloatArray, uv: FloatArray, instance: int) -> None:
         """Add a grid of quads.
@@ -142,7 +139,7 @@ class Site:
     def quad(self, corner: FloatArray, along: FloatArray, up: FloatArray, instance: int) -> None:
         """Add one parallelogram, textured in metres from its corner."""
         points = np.stack([[corner, corner + along], [corner + up, corner + along + up]])
-        width, height = float(np.linalg.norm(along)), float(np.linalg.norm(up))
+        width, height = np.linalg.norm(along), np.linalg.norm(up)
         self.patch(
             points, np.array([[[0, 0], [width, 0]], [[0, height], [width, height]]]), instance
         )
@@ -179,7 +176,7 @@ class Site:
         self, base: FloatArray, tip: FloatArray, radii: tuple[float, float], instance: int
     ) -> None:
         """Six-sided tapering tube from ``base`` to ``tip``, ``(3,)`` each."""
-        height = np.linalg.norm(tip - base)
+        height = float(np.linalg.norm(tip - base))
         axis = (tip - base) / height
         side = np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.7 else [0.0, 1.0, 0.0])
         side /= np.linalg.norm(side)
@@ -187,8 +184,13 @@ class Site:
         angle = np.linspace(0.0, 2.0 * np.pi, 7)
         ring = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * other  # (7, 3)
         points = np.stack([base + radii[0] * ring, tip + radii[1] * ring])
-        uv = np.stack(np.meshgrid(angle * radii[0], [0.0, height]), axis=2)
-        self.patch(points, uv, instance)
+        self.patch(points, lattice(angle * radii[0], (0.0, height)), instance)
+
+    def pole(self, height: float, radii: tuple[float, float], instance: int) -> FloatArray:
+        """A `tube` that stands at the place; its tip ``(3,)``."""
+        tip = self.origin + height * UP
+        self.tube(self.origin, tip, radii, instance)
+        return tip
 
     def ball(self, centre: FloatArray, radii: ArrayLike, instance: int) -> None:
         """A lumpy ellipsoid of 6 x 9 faces around a point ``(3,)``."""
@@ -210,7 +212,7 @@ class Site:
         vertices = bend(np.concatenate(points))
         triangles = np.concatenate([mine + k for mine, k in zip(triangles_of, first)])
         uv, instance = np.concatenate(uv_of), np.concatenate(instances)
-        materials, colours, parameters = map(np.array, zip(*self._looks))
+        materials, colours, parameters = map(np.array, zip(*self.looks))
         corners = vertices[triangles]  # (T, 3, 3)
         edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         normals = np.cross(edge1, edge2)
@@ -219,7 +221,7 @@ class Site:
         uv1, uv2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
         determinant = uv1[:, 0] * uv2[:, 1] - uv2[:, 0] * uv1[:, 1]
         tangents = (edge1 * uv2[:, 1:] - edge2 * uv1[:, 1:]) * np.sign(determinant)[:, None]
-        tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
+        tangents = unit(tangents)
         normals /= np.maximum(area, 1e-9)[:, None]
         return Mesh(
             vertices=vertices.astype(np.float32),
@@ -231,7 +233,7 @@ class Site:
             material=materials.astype(np.int8)[instance[keep]],
             colours=_last(colours),
             parameters=_last(parameters),
-            offsets=_last(self.rng.uniform(0.0, 200.0, (self.instances, 2))),
+            offsets=_last(self.rng.uniform(0.0, 200.0, (len(self.looks), 2))),
         )
 
 
@@ -245,14 +247,12 @@ class Moving:
 
     def __init__(self, rng: np.random.Generator, makers: Sequence[Callable[[Site], None]]) -> None:
         """Things that are made one after another at one site."""
-        site, first_instances = Site(rng), []
+        site, after = Site(rng), []
         for make in makers:
-            first_instances.append(site.instances)
             make(site)
+            after.append(len(site.looks))
         self._mesh = site.finish(FLAT)
-        self._thing_of_triangle = (
-            np.searchsorted(first_instances, self._mesh.instance, side="right") - 1
-        )
+        self._thing_of_triangle = np.searchsorted(after, self._mesh.instance, side="right")
 
     def placed(self, T_scene_things: dict[int, FloatArray]) -> list[Mesh]:
         """One mesh of the things of these numbers at their poses ``(4, 4)``; none of no things."""
@@ -278,13 +278,17 @@ class Moving:
         return dataclasses.replace(self._mesh, vertices=vertices, **tables)
 
 
+def lattice(u: ArrayLike, v: ArrayLike) -> FloatArray:
+    """Coordinates of a grid ``(R, C, 2)`` by those of its columns ``(C,)`` and of its rows ``(R,)``."""
+    return np.stack(np.meshgrid(u, v), axis=2)
+
+
 def grid_over(rectangle: Rectangle, z: float, step: float) -> FloatArray:
     """Vertices over a rectangle about ``step`` metres apart, ``(R, C, 3)``."""
     x0, y0, x1, y1 = rectangle
     x = np.linspace(x0, x1, max(1, int((x1 - x0) / step)) + 1)
     y = np.linspace(y0, y1, max(1, int((y1 - y0) / step)) + 1)
-    gx, gy = np.meshgrid(x, y)
-    return np.stack([gx, gy, np.full_like(gx, z)], axis=2)
+    return np.pad(lattice(x, y), ((0, 0), (0, 0), (0, 1)), constant_values=z)
 
 
 def corners_of(rectangle: Rectangle) -> FloatArray:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.runtime.imports import import_open3d
-from slam.simulation.geometry import Float32Array, FloatArray, Mesh
+from slam.simulation.geometry import Float32Array, FloatArray, Mesh, luck
 from slam.simulation.objects import bonnet, car
 from slam.simulation.options import SimulationOptions, draw_variety
 from slam.simulation.route import STEP, Route, plan_route
@@ -52,7 +52,7 @@ class SimulatedStreet(SimulatedWorld):
     """A street world and a drive through it; the attributes are those of `SimulatedWorld`."""
 
     camera_height_m: float
-    T_camera_lidar: FloatArray
+    T_camera_lidar = T_CAMERA_LIDAR
 
     def __init__(self, options: SimulationOptions) -> None:
         """Plan the drive.
@@ -62,21 +62,19 @@ class SimulatedStreet(SimulatedWorld):
         """
         size = options.width, options.height
         still = STILL_FRAMES if "stop" in options.hazards else 0
-        variety = (
-            draw_variety(options.seed, options.route == "straight") if options.varied else None
-        )
-        camera = KITTI_CAMERA.resized(*size) if variety is None else variety.camera(*size)
+        camera, variety = KITTI_CAMERA.resized(*size), None
+        weather = draw_weather
+        if options.varied:
+            variety = draw_variety(options.seed, options.route == "straight")
+            camera, weather = variety.camera(*size), draw_varied_weather
         if options.fov_deg is not None:
             camera = square_camera(*size, options.fov_deg)
         self._route = plan_route(options.route, options.frames, options.seed, still, variety)
         super().__init__(options, camera, self._route.T_street_camera)
         self.camera_height_m = self._route.camera_height_m
-        self.T_camera_lidar = T_CAMERA_LIDAR.copy()
         self._variety = variety
-        self._weather = (
-            draw_varied_weather(options.seed) if options.varied else draw_weather(options.seed)
-        )
-        rng = np.random.default_rng([options.seed, 31])
+        self._weather = weather(options.seed)
+        rng = luck(options.seed, 31)
         # gain and gamma of every frame, piecewise constant
         exposures: list[list[float]] = []
         while len(exposures) < options.frames:
@@ -92,7 +90,7 @@ class SimulatedStreet(SimulatedWorld):
     def scan(self, index: int) -> Float32Array:
         """LiDAR points of a frame ``(M, 4)``: x, y, z in the LiDAR, metres, and reflectance."""
         self._require(index)
-        rng = np.random.default_rng([self.options.seed, 40, index])
+        rng = luck(self.options.seed, 40, index)
         # each spin starts at a random angle: with the same rays in every scan the rings on the
         # ground would repeat exactly, and scan matching would estimate zero motion
         azimuth = (np.arange(COLUMNS) + rng.uniform()) * (2.0 * np.pi / COLUMNS)
@@ -100,7 +98,7 @@ class SimulatedStreet(SimulatedWorld):
         elevation = elevation + rng.normal(0.0, ELEVATION_NOISE, (BEAMS, COLUMNS))
         x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
         directions = np.stack([x, y, np.sin(elevation)], axis=-1).reshape(-1, 3).astype(np.float32)
-        rays = place_rays(self._T_scene_camera[index] @ self.T_camera_lidar, directions)
+        rays = place_rays(self._T_scene_camera[index] @ T_CAMERA_LIDAR, directions)
         ranges = np.full(len(rays), np.inf, dtype=np.float32)
         reflectance = np.zeros(len(rays), dtype=np.float32)
         for surface in self._surfaces(index):
@@ -130,7 +128,7 @@ class SimulatedStreet(SimulatedWorld):
         """The bonnet of the own car; none under motion blur, which would smear it."""
         if self._variety is None or self._variety.bonnet == 0.0 or "blur" in self.options.hazards:
             return None
-        rng = np.random.default_rng([self.options.seed, 12])
+        rng = luck(self.options.seed, 12)
         below = (
             self.options.height * (1.0 - self._variety.bonnet) - self.camera.cy
         ) / self.camera.fy
@@ -222,16 +220,14 @@ class SimulatedStreet(SimulatedWorld):
         if self._variety is not None:
             y, x = (np.linspace(-1.0, 1.0, side, dtype=np.float32) for side in rgb.shape[:2])
             falloff = 1.0 - np.float32(0.5 * self._variety.vignette) * (x * x + (y * y)[:, None])
-            grain = np.random.default_rng([self.options.seed, 35, index]).standard_normal(
-                rgb.shape, dtype=np.float32
-            )
+            grain = luck(self.options.seed, 35, index).standard_normal(rgb.shape, dtype=np.float32)
             rgb = np.asarray(rgb * falloff[..., None] + np.float32(self._variety.noise) * grain)
         return rgb
 
 
 def rained_on(rgb: Float32Array, seed: int, index: int) -> Float32Array:
     """Rain streaks and reduced contrast over an image ``(H, W, 3)`` about [0, 1]."""
-    rng = np.random.default_rng([seed, 32, index])
+    rng = luck(seed, 32, index)
     height, width = rgb.shape[:2]
     drops = (rng.random((height, width)) < 0.005).astype(np.float32) * rng.uniform(0.4, 1.0)
     length = max(3, height // 11)
@@ -278,7 +274,7 @@ def _draw_tint(
 
 def draw_weather(seed: int) -> Weather:
     """Weather of a world."""
-    rng = np.random.default_rng([seed, 20])
+    rng = luck(seed, 20)
     sun, sunshine = _draw_sun(rng, 0.5, 1.1), rng.uniform(0.25, 0.75)
     return Weather(
         sun=sun.astype(np.float32),
@@ -297,7 +293,7 @@ def draw_varied_weather(seed: int) -> Weather:
 
     Three in four have a sun beside which shadows are 3 to 10 times as dark.
     """
-    rng = np.random.default_rng([seed, 21])
+    rng = luck(seed, 21)
     sun = _draw_sun(rng, 0.3, 1.15)
     sunny = rng.random() < 0.75
     ambient = (
@@ -324,7 +320,7 @@ class Traffic:
     """Moving cars: one ahead of the camera for a while, others oncoming; some may overtake it."""
 
     def __init__(self, drive: Route, seed: int, overtaking: bool = False) -> None:
-        rng = np.random.default_rng([seed, 33])
+        rng = luck(seed, 33)
         self._route = drive
         # offset in lane samples, per frame, to the left in metres, along the lane or against it
         self._courses: list[tuple[float, float, float, float]] = []
@@ -336,7 +332,7 @@ class Traffic:
             self._courses.append((start, speed, left_m, -1.0))
             meets += rng.uniform(12.0, 40.0)
         if overtaking:
-            self._plan_passing(np.random.default_rng([seed, 34]))
+            self._plan_passing(luck(seed, 34))
         self._gap = rng.uniform(9.0, 14.0) / STEP
         self._leader_leaves = rng.uniform(0.4, 0.8) * len(drive.sample)
         self._cars = Moving(rng, [car] * (1 + len(self._courses)))

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from slam.simulation.geometry import Float32Array, Material
-from slam.simulation.texture import Axis, Octave, Shader, Texels, cell_hash, grained, mix
+from slam.simulation.geometry import Material
+from slam.simulation.texture import Axis, Lengths, Octave, Shader, Texels, cell_hash, grained, mix
 
 
-def _asphalt(texels: Texels) -> Float32Array:
+def _asphalt(texels: Texels) -> Lengths:
     rgb = _junction(texels)
     half, dash, fraction, edged, lane = texels.parameters[:5, 0].tolist()
     lengthways = texels.u.stripes(2.0 * dash, 2.0 * dash * fraction)
@@ -27,7 +27,7 @@ def _asphalt(texels: Texels) -> Float32Array:
     return rgb
 
 
-def _junction(texels: Texels) -> Float32Array:
+def _junction(texels: Texels) -> Lengths:
     grain = texels.fractal(
         (7.0, 2.2, 0.17), (2.0, 0.5, 0.22), (1.1, 0.17, 0.2), (0.35, 0.24, 0.2), (0.11, 0.07, 0.16)
     )
@@ -39,7 +39,7 @@ def _junction(texels: Texels) -> Float32Array:
     return np.asarray(texels.first * (1.0 + rough * grain - rough * patch - rough * crack))
 
 
-def _pavement(texels: Texels) -> Float32Array:
+def _pavement(texels: Texels) -> Lengths:
     slab = float(texels.parameters[0, 0])
     near = np.clip(slab / texels.size / 2.0 - 0.5, 0.0, 1.0)
     tone = (cell_hash(texels.u.at / slab, texels.v.at / slab, 1) - 0.5) * near * 0.3
@@ -48,7 +48,7 @@ def _pavement(texels: Texels) -> Float32Array:
     return mix(texels.first * (1.0 + grain + tone), 0.6 * texels.second, joints)
 
 
-def _kerb(texels: Texels) -> Float32Array:
+def _kerb(texels: Texels) -> Lengths:
     grain = texels.fractal((2.5, 2.5, 0.14), (0.5, 0.5, 0.16), (0.12, 0.12, 0.16))
     return mix(texels.first * (1.0 + grain), 0.6 * texels.second, texels.u.stripes(1.0, 0.03))
 
@@ -60,7 +60,7 @@ def _mottled(*octaves: Octave) -> Shader:
     )
 
 
-def _wall(texels: Texels) -> Float32Array:
+def _wall(texels: Texels) -> Lengths:
     _, spacing, window, _, style, height = texels.parameters
     u, v = texels.u.at - 0.5 * (spacing - window), texels.v.at
     grain = texels.fractal(
@@ -80,7 +80,7 @@ def _wall(texels: Texels) -> Float32Array:
     return rgb
 
 
-def _windows(rgb: Float32Array, texels: Texels) -> Float32Array:
+def _windows(rgb: Lengths, texels: Texels) -> Lengths:
     """Rows of framed windows, and doors on the ground floor, painted over a wall ``(3, N)``."""
     floor, spacing, window, tall = texels.parameters[:4]
     u, v = texels.u.at - 0.5 * (spacing - window), texels.v.at
@@ -93,9 +93,9 @@ def _windows(rgb: Float32Array, texels: Texels) -> Float32Array:
     high = np.where(door, np.float32(2.2), low + tall)
     x, y = texels.u.on(u - column * spacing), texels.v.on(v - storey * floor)
 
-    def opening(border: float) -> Float32Array:
+    def opening(border: float) -> Lengths:
         across = x.band(-border, window + border)
-        return np.asarray(across * y.band(low - border, high + border))
+        return across * y.band(low - border, high + border)
 
     framed, pane = opening(0.11), opening(-0.03)
     # a cross of glazing bars, and panes that mirror a bright or a dark part of the street
@@ -113,13 +113,13 @@ def _windows(rgb: Float32Array, texels: Texels) -> Float32Array:
     return mix(rgb, inside, pane * ~blind)
 
 
-def _roof(texels: Texels) -> Float32Array:
+def _roof(texels: Texels) -> Lengths:
     rows, tiles = texels.v.stripes(0.35, 0.09), texels.u.stripes(0.3, 0.05)
     grain = texels.fractal((4.0, 3.0, 0.25), (0.9, 0.8, 0.22), (0.3, 0.35, 0.22))
     return np.asarray(texels.first * (1.0 + grain - 0.3 * rows - 0.15 * tiles))
 
 
-def _sign(texels: Texels) -> Float32Array:
+def _sign(texels: Texels) -> Lengths:
     half, kind = texels.parameters[:2]
     x, y = np.abs(texels.u.at - half), texels.v.at - half
     edge = np.where(kind == 0, np.hypot(x, y), np.maximum(x, np.abs(y))) / half
@@ -127,10 +127,10 @@ def _sign(texels: Texels) -> Float32Array:
     bar = texels.v.on(y).band(-0.14 * half, 0.16 * half) * texels.u.on(x).band(-1.0, 0.5 * half)
     figure = np.maximum(rim, bar)
     plain = mix(texels.second, texels.first, figure)
-    return np.asarray(np.where(kind == 2, mix(texels.first, texels.second, figure), plain))
+    return np.where(kind == 2, mix(texels.first, texels.second, figure), plain)
 
 
-def _paint(texels: Texels) -> Float32Array:
+def _paint(texels: Texels) -> Lengths:
     seams = np.maximum(texels.u.stripes(1.05, 0.05, -0.2), texels.v.band(-0.1, 0.1))
     light = (
         1.0
@@ -140,18 +140,18 @@ def _paint(texels: Texels) -> Float32Array:
     return mix(texels.first * light, texels.second, 0.7 * seams)
 
 
-def _glass(texels: Texels) -> Float32Array:
+def _glass(texels: Texels) -> Lengths:
     pillars = np.maximum(texels.u.stripes(1.1, 0.14, 0.05), texels.v.band(-0.2, 0.05))
     sheen = np.clip(1.0 + 1.6 * texels.fractal((0.8, 0.35, 1.0), (0.3, 0.2, 0.5)), 0.3, 4.0)
     return mix(texels.first * sheen, texels.second, pillars)
 
 
-def _tyre(texels: Texels) -> Float32Array:
+def _tyre(texels: Texels) -> Lengths:
     radius = np.hypot(texels.u.at, texels.v.at)
     return mix(texels.first, texels.second, Axis(radius, texels.size, radius).band(-1.0, 0.19))
 
 
-def _fence(texels: Texels) -> Float32Array:
+def _fence(texels: Texels) -> Lengths:
     gap, height = texels.parameters[:2]
     slats = texels.u.stripes(gap, 0.35 * gap)
     rails = 1.0 - texels.v.band(0.78 * height, 0.88 * height)
@@ -160,22 +160,22 @@ def _fence(texels: Texels) -> Float32Array:
 
 
 STREET_SHADERS: dict[Material, Shader] = {
-    Material.ASPHALT: _asphalt,
-    Material.JUNCTION: _junction,
-    Material.PAVEMENT: _pavement,
-    Material.KERB: _kerb,
-    Material.GRASS: _mottled(
+    "asphalt": _asphalt,
+    "junction": _junction,
+    "pavement": _pavement,
+    "kerb": _kerb,
+    "grass": _mottled(
         (24.0, 24.0, 0.3), (8.0, 8.0, 0.35), (2.5, 2.5, 0.35), (0.7, 0.7, 0.4), (0.2, 0.2, 0.4)
     ),
-    Material.GRAVEL: _mottled((6.0, 6.0, 0.3), (1.2, 1.2, 0.3), (0.3, 0.3, 0.4), (0.1, 0.1, 0.3)),
-    Material.WALL: _wall,
-    Material.ROOF: _roof,
-    Material.BARK: _mottled((0.12, 0.6, 0.5), (0.4, 1.5, 0.4)),
-    Material.LEAVES: _mottled((1.6, 1.6, 0.4), (0.55, 0.55, 0.6), (0.2, 0.2, 0.5)),
-    Material.METAL: grained((0.5, 1.3, 0.25), (0.2, 0.4, 0.2)),
-    Material.SIGN: _sign,
-    Material.PAINT: _paint,
-    Material.GLASS: _glass,
-    Material.TYRE: _tyre,
-    Material.FENCE: _fence,
+    "gravel": _mottled((6.0, 6.0, 0.3), (1.2, 1.2, 0.3), (0.3, 0.3, 0.4), (0.1, 0.1, 0.3)),
+    "wall": _wall,
+    "roof": _roof,
+    "bark": _mottled((0.12, 0.6, 0.5), (0.4, 1.5, 0.4)),
+    "leaves": _mottled((1.6, 1.6, 0.4), (0.55, 0.55, 0.6), (0.2, 0.2, 0.5)),
+    "metal": grained((0.5, 1.3, 0.25), (0.2, 0.4, 0.2)),
+    "sign": _sign,
+    "paint": _paint,
+    "glass": _glass,
+    "tyre": _tyre,
+    "fence": _fence,
 }

@@ -22,7 +22,7 @@ def _lattice() -> Float32Array:
     return np.random.default_rng(20261121).uniform(-1.0, 1.0, _SIZE * _SIZE).astype(np.float32)
 
 
-def value_noise(u: Lengths, v: Lengths) -> Float32Array:
+def value_noise(u: Lengths, v: Lengths) -> Lengths:
     """Smooth noise in [-1, 1] with one lattice cell per unit, ``(N,)``."""
     table = _lattice()
     whole_u, whole_v = np.floor(u), np.floor(v)
@@ -42,16 +42,14 @@ def value_noise(u: Lengths, v: Lengths) -> Float32Array:
     return top
 
 
-def cell_hash(u: Lengths, v: Lengths, salt: int) -> Float32Array:
+def cell_hash(u: Lengths, v: Lengths, salt: int) -> Lengths:
     """A random number in [0, 1] for each integer cell, ``(N,)``."""
     i = (np.floor(u).astype(np.int32) + 37 * salt) & 255
     j = (np.floor(v).astype(np.int32) + 101 * salt) & 255
-    return np.asarray(0.5 + 0.5 * np.take(_lattice(), (i << 8) | j))
+    return 0.5 + 0.5 * np.take(_lattice(), (i << 8) | j)
 
 
-def mix(
-    a: Lengths | np.floating[Any], b: Lengths | np.floating[Any], fraction: Lengths
-) -> Float32Array:
+def mix(a: Lengths | np.floating[Any], b: Lengths | np.floating[Any], fraction: Lengths) -> Lengths:
     """Blend colours ``(3, N)`` by a weight ``(N,)``."""
     return np.asarray(a + fraction * (b - a), dtype=np.float32)
 
@@ -70,7 +68,7 @@ class Axis:
 
     def stripes(
         self, period: Lengths | float, width: Lengths | float, moved: float = 0.0
-    ) -> Float32Array:
+    ) -> Lengths:
         """Fraction of each pixel, moved on, that stripes [k period, k period + width] cover."""
         half = 0.5 * np.maximum(self.size, 1e-4)
         x = self.at + moved
@@ -79,13 +77,13 @@ class Axis:
             whole = np.floor(at / period)
             return np.asarray(whole * width + np.minimum(at - whole * period, width))
 
-        return np.asarray((integral(x + half) - integral(x - half)) / (2.0 * half))
+        return (integral(x + half) - integral(x - half)) / (2.0 * half)
 
-    def band(self, low: Lengths | float, high: Lengths | float) -> Float32Array:
+    def band(self, low: Lengths | float, high: Lengths | float) -> Lengths:
         """Fraction of each pixel covered by the one stripe [low, high]."""
         inverse = 1.0 / np.maximum(self.size, 1e-4)
         after, beyond = (np.clip((self.at - edge) * inverse + 0.5, 0, 1) for edge in (low, high))
-        return np.asarray(after - beyond)
+        return after - beyond
 
 
 @dataclass(frozen=True)
@@ -99,7 +97,7 @@ class Texels:
     parameters: Float32Array  # of its texture, (PARAMETERS, N)
 
     @property
-    def size(self) -> Float32Array:
+    def size(self) -> Lengths:
         """The larger extent of each pixel on the surface, metres, ``(N,)``."""
         return np.maximum(self.u.size, self.v.size)
 
@@ -111,7 +109,7 @@ class Texels:
         tables = (self.first, self.second, self.parameters)
         return Texels(u, v, *(table[:, index] for table in tables))
 
-    def fractal(self, *octaves: Octave) -> Float32Array:
+    def fractal(self, *octaves: Octave) -> Lengths:
         """Sum of noise octaves, each faded out where its waves are smaller than about two pixels."""
         total = np.zeros_like(self.u.at)
         for k, (wave_u, wave_v, amplitude) in enumerate(octaves):
@@ -125,21 +123,21 @@ class Texels:
 
     def joints(
         self, along: Lengths | float, up: Lengths | float, width: Lengths | float
-    ) -> Float32Array:
+    ) -> Lengths:
         """Coverage by the joints between tiles of a size along u and up v."""
         return np.maximum(self.u.stripes(along, width), self.v.stripes(up, width))
 
-    def rim(self, border: float) -> Float32Array:
+    def rim(self, border: float) -> Lengths:
         """Coverage by the border of a thing, whose first parameters are its width and height."""
         width, height = self.parameters[:2]
         inside = self.u.band(border, width - border) * self.v.band(border, height - border)
-        return np.asarray(1.0 - inside)
+        return 1.0 - inside
 
 
 # unlit RGB (3, N), about [0, 1], of the pixels of a material
-Shader = Callable[[Texels], Float32Array]
+Shader = Callable[[Texels], Lengths]
 
 
 def grained(*octaves: Octave) -> Shader:
     """One colour under noise."""
-    return lambda texels: np.asarray(texels.first * (1.0 + texels.fractal(*octaves)))
+    return lambda texels: texels.first * (1.0 + texels.fractal(*octaves))

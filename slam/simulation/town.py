@@ -4,10 +4,10 @@ import numpy as np
 
 from slam.geometry import se3
 from slam.simulation import objects
-from slam.simulation.geometry import Bend, FloatArray, Material, Mesh
+from slam.simulation.geometry import Bend, FloatArray, Mesh, luck, unit
 from slam.simulation.open_land import open_land
 from slam.simulation.route import KERB, Node, StreetPlan
-from slam.simulation.shapes import Rectangle, Site, corners_of, directed, grid_over
+from slam.simulation.shapes import Rectangle, Site, corners_of, directed, grid_over, lattice
 
 LANE = 3.6  # width on a motorway, metres
 ROUNDING = 5.0  # radius of kerbs at corners, metres
@@ -22,8 +22,8 @@ def build_town(plan: StreetPlan, bend: Bend, seed: int, varied: bool = False) ->
         seed: of the world.
         varied: whether there are railings, posts and people as well.
     """
-    rng = np.random.default_rng([seed, 10])
-    town = _Town(plan, rng, np.random.default_rng([seed, 11]) if varied else None)
+    rng = luck(seed, 10)
+    town = _Town(plan, rng, luck(seed, 11) if varied else None)
     town.ground()
     for i in range(len(plan.xs) - 1):
         for j in range(len(plan.ys) - 1):
@@ -62,15 +62,13 @@ class _Town:
         lanes = LANE if plan.kind == "motorway" else 0.0
         smooth = 0.0 if more is None else more.uniform(0.2, 0.85)
         lines = (plan.half_width, dash, fraction, edged, lanes, smooth)
-        self.asphalt = site.instance(Material.ASPHALT, grey, paint, lines)
-        self.junction = site.instance(
-            Material.JUNCTION, grey, paint, (0.0, 0.0, 0.0, 0.0, 0.0, smooth)
-        )
+        self.asphalt = site.instance("asphalt", grey, paint, lines)
+        self.junction = site.instance("junction", grey, paint, lines)
         slab = (rng.uniform(0.5, 1.2),)
-        self.pavement = site.instance(Material.PAVEMENT, stone, 0.7, slab)
-        self.kerb = site.instance(Material.KERB, 1.15 * stone, 0.6 * stone)
-        self.grass = site.instance(Material.GRASS, turf, 0.55)
-        self.gravel = site.instance(Material.GRAVEL, 0.9 * stone, 0.5 * stone)
+        self.pavement = site.instance("pavement", stone, 0.7, slab)
+        self.kerb = site.instance("kerb", 1.15 * stone, 0.6 * stone)
+        self.grass = site.instance("grass", turf, 0.55)
+        self.gravel = site.instance("gravel", 0.9 * stone, 0.5 * stone)
         if self.open:
             self.pavement = self.kerb = self.grass if rng.random() < 0.6 else self.gravel
         if plan.kind == "avenue":
@@ -113,8 +111,8 @@ class _Town:
             points, length = grid_over(rectangle, 0.0, 2.0), x1 - x0
         rows, columns = points.shape[:2]
         half = self.plan.half_width
-        uv = np.meshgrid(np.linspace(0.0, length, columns), np.linspace(-half, half, rows))
-        self.site.patch(points, np.stack(uv, axis=2), self.asphalt)
+        uv = lattice(np.linspace(0.0, length, columns), np.linspace(-half, half, rows))
+        self.site.patch(points, uv, self.asphalt)
 
     def _slab(self, rectangle: Rectangle, z: float, instance: int, step: float = 3.0) -> None:
         """A level rectangle, textured by its plan coordinates."""
@@ -144,18 +142,15 @@ class _Town:
     def _pavement(self, outer: Rectangle, inner: Rectangle, sides: list[bool]) -> None:
         """A ring of paving between a rounded outline and the lots, and the kerb below its edge."""
         rim, corners = [], corners_of(outer)
-        for k in range(4):
-            here = corners[k]
-            after = corners[(k + 1) % 4]
-            before = corners[k - 1]
+        edges = np.roll(corners, -1, axis=0) - corners
+        for k, (here, ahead) in enumerate(zip(corners, unit(edges))):
             radius = ROUNDING if sides[k] and sides[k - 1] else 0.01
-            ahead = (after - here) / np.linalg.norm(after - here)
-            back = (before - here) / np.linalg.norm(before - here)
+            back = -unit(edges)[k - 1]
             for angle in np.linspace(0.0, np.pi / 2.0, 6):
                 rim.append(
                     here + radius * ((1.0 - np.sin(angle)) * back + (1.0 - np.cos(angle)) * ahead)
                 )
-            reach = float(np.linalg.norm(after - here)) - ROUNDING - 1.0
+            reach = np.linalg.norm(edges[k]) - ROUNDING - 1.0
             rim += [here + along * ahead for along in np.arange(ROUNDING + 2.0, reach, 2.5)]
         edge = np.stack([*rim, rim[0]])
         inside = np.clip(edge, [inner[0], inner[1]], [inner[2], inner[3]])
@@ -164,15 +159,14 @@ class _Town:
         length = se3.distance_along(edge)
         step = ring[[0, 0]].copy()
         step[0, :, 2] = -0.1
-        self.site.patch(step, np.stack([np.stack([length] * 2), step[..., 2]], axis=2), self.kerb)
+        self.site.patch(step, lattice(length, (-0.1, KERB)), self.kerb)
         lip = ring[[0, 0]].copy()
         lip[..., 2] += 0.004
         towards = inside - edge
         lip[1, :, :2] += (
             0.16 * towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 0.16)
         )
-        across = np.stack([np.zeros_like(length), np.full_like(length, 0.16)])
-        self.site.patch(lip, np.stack([np.stack([length] * 2), across], axis=2), self.kerb)
+        self.site.patch(lip, lattice(length, (0.0, 0.16)), self.kerb)
 
     def _furnish(self, start: FloatArray, end: FloatArray) -> None:
         """Trees, lamps and signs along a kerb with its block on the left, and cars before it."""

@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.formats.ply import distances, scene_of
+from slam.formats.ply import Ply, distances, scene_of
 from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.runtime.imports import import_open3d
-from slam.simulation.geometry import Float32Array, FloatArray, Material, Mesh
+from slam.simulation.geometry import MATERIALS, Float32Array, FloatArray, Mesh
 from slam.simulation.options import SimulationOptions
 from slam.simulation.room_textures import ROOM_SHADERS
 from slam.simulation.street_textures import STREET_SHADERS
@@ -48,17 +48,12 @@ def place_rays(T_scene_sensor: FloatArray, directions: Float32Array) -> Float32A
     Of several poses ``(H, 4, 4)`` each is that of an equal share of the directions in turn, as of
     the rows of an image.
     """
-    rays = np.empty((len(directions), 6), dtype=np.float32)
-    if T_scene_sensor.ndim == 3:
-        by_row = directions.reshape(len(T_scene_sensor), -1, 3)
-        rays[:, :3] = np.repeat(T_scene_sensor[:, :3, 3], by_row.shape[1], axis=0)
-        rays[:, 3:] = (
-            by_row @ T_scene_sensor[:, :3, :3].swapaxes(1, 2).astype(np.float32)
-        ).reshape(-1, 3)
-        return rays
-    rays[:, :3] = T_scene_sensor[:3, 3]
-    rays[:, 3:] = directions @ T_scene_sensor[:3, :3].T.astype(np.float32)
-    return rays
+    poses = T_scene_sensor.reshape(-1, 4, 4)
+    of_pose = directions.reshape(len(poses), -1, 3)
+    rays = np.empty((*of_pose.shape[:2], 6), dtype=np.float32)
+    rays[..., :3] = poses[:, None, :3, 3]
+    rays[..., 3:] = of_pose @ poses[:, :3, :3].swapaxes(1, 2).astype(np.float32)
+    return rays.reshape(-1, 6)
 
 
 @dataclass(frozen=True)
@@ -96,7 +91,7 @@ class Hits:
                 second,
                 np.take(mesh.parameters, instance, axis=1),
             )
-            rgb[:, part] = SHADERS[Material(kind)](texels)
+            rgb[:, part] = SHADERS[MATERIALS[kind]](texels)
         return rgb
 
     def _footprint(self, pixel: Float32Array) -> tuple[Float32Array, Float32Array]:
@@ -196,16 +191,16 @@ class SimulatedWorld(ABC):
         depth[depth >= FARTHEST_M] = 0.0
         return depth.reshape(self.options.height, self.options.width)
 
-    def distance_to_surface(self, points_world: NDArray[np.floating[Any]]) -> FloatArray:
+    def distance_to_surface(self, points_world: FloatArray) -> FloatArray:
         """Distance in metres from points ``(M, 3)`` to the nearest static surface, ``(M,)``."""
-        points = se3.apply(self._T_scene_camera[0], np.asarray(points_world, dtype=np.float64))
-        return distances(self._still.scene, points)
+        return distances(self._still.scene, se3.apply(self._T_scene_camera[0], points_world))
 
-    def mesh_world(self) -> tuple[Float32Array, NDArray[np.uint32]]:
-        """What stands still: vertices ``(V, 3)`` in the first camera, triangles ``(T, 3)``."""
-        mesh = self._still.mesh
-        vertices = se3.apply(se3.invert(self._T_scene_camera[0]), mesh.vertices.astype(np.float64))
-        return vertices.astype(np.float32), mesh.triangles
+    def mesh_world(self) -> Ply:
+        """What stands still, in the frame of the first camera."""
+        mesh, T_world_scene = self._still.mesh, se3.invert(self._T_scene_camera[0])
+        points = se3.apply(T_world_scene, mesh.vertices.astype(np.float64)).astype("<f4")
+        vertices = points.view([(axis, "<f4") for axis in "xyz"])[:, 0]
+        return Ply(vertices, mesh.triangles.astype(np.int64))
 
     def scan(self, index: int) -> Float32Array:
         """LiDAR points of a frame ``(M, 4)``: x, y, z in the LiDAR, metres, and reflectance."""

@@ -29,10 +29,11 @@ from slam.frames import (
     resized_depth,
     trusted_depth,
 )
+from slam.frontend.followed_corners import CornerRecord
 from slam.frontend.tracking import CornerTracker, PredictedFlow, Tracks
+from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.history import MotionHistory
 from slam.frontend.visual.motion import Motion, RelativeRotation, pose_sigmas
-from slam.frontend.visual.self_calibration import DepthError, FocalLength
 from slam.frontend.visual.two_view import (
     CORNER_CORRELATION,
     DEPTH_RELATIVE_SIGMA,
@@ -95,9 +96,10 @@ _LEAST_COMMON = 12  # points by which two steps compare their lengths
 class VisualOdometry:
     """Measures ``T_previous_current`` between frames of one sequence, in the unscaled unit of depth.
 
-    ``depth_error`` is that of learned depth and ``focal_length`` the one that corners show, by the
-    steps so far; ``below_is_nearer`` says of each whether corners below the axis are nearer than
-    those above. ``found`` is the share of corners that the last measurement found again.
+    ``depth_error`` is that of learned depth by the steps so far, ``corners`` are those of their
+    keyframes, in half widths from the principal point; ``below_is_nearer`` says of each whether
+    corners below the axis are nearer than those above. ``found`` is the share of corners that the
+    last measurement found again.
     """
 
     def __init__(self, intrinsics: Intrinsics, seed: int = 0) -> None:
@@ -111,7 +113,7 @@ class VisualOdometry:
         self._focal = intrinsics.fx, intrinsics.fy
         self._seed = seed
         self._tracker = CornerTracker()
-        self.depth_error, self.focal_length = DepthError(), FocalLength()
+        self.depth_error, self.corners = DepthError(), CornerRecord()
         self.below_is_nearer: list[bool] = []
         self._dynamic_mask = DynamicMask.empty(intrinsics.width, intrinsics.height)
         self._history = MotionHistory()
@@ -334,9 +336,8 @@ class VisualOdometry:
         self._history = self._history.with_step(two_view.unit_pose, step.inlier_ratio, speed)
         length = step.motion.length_unscaled
         self.depth_error = self.depth_error.with_step(learned[still], nearness, sigma, length)
-        self.focal_length = self.focal_length.with_step(
-            *rays, two_view.unit_pose, self._intrinsics.fx
-        )
+        image = rays[1][:, :2] * self._intrinsics.focal_half_widths
+        self.corners.add(tracks.track_ids[still], image)
         self._points = step.motion.ends[1], step.points
         self._fitted = tracks.track_ids[two_view.inliers]
 

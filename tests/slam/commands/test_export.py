@@ -14,6 +14,7 @@ import pytest
 import yaml
 from meshes import coloured_ply
 
+from erfsfm.common.readers.camera_file import read_camera_file
 from slam.commands.cli import app
 from slam.commands.export import R_UP_WORLDS, export
 from slam.formats.ply import Ply, read_ply, write_ply
@@ -263,6 +264,8 @@ def test_images_of_a_lens_are_undistorted(make_recorded: MakeRecorded, tmp_path:
     folder.write(PLACES, Places(camera, (), np.zeros((0, 4, 4))).write)
     content = scene(export(folder, "nerfstudio", tmp_path / "scene"))
     assert content["fl_x"] == camera.fx and content["k1"] == 0
+    written = read_camera_file(tmp_path / "scene" / "camera.yaml")  # for erfsfm train
+    assert written.fx == camera.fx and not written.is_distorted
 
 
 def test_frames_without_a_usable_image_are_left_out(

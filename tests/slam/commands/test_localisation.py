@@ -23,6 +23,7 @@ from slam.loops.places import Places
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
 from slam.runtime.files import PLACES
+from slam.sequences.camera_file import write_camera
 from slam.simulation.options import SimulationOptions
 from slam.simulation.recording import SimulatedSequence
 
@@ -168,6 +169,10 @@ def test_images_of_a_lens_need_its_camera_file(
             match=r"undistorted its images, and .*album has no camera\.yaml: give its",
         ):
             localise(tmp_path / "album", run)
+        write_camera(run.path, lens, None)
+        assert localise(tmp_path / "album", run)[0].T_world_camera is not None
+        write_camera(run.path, lens, np.ones((lens.height, lens.width), np.bool_))
+        assert localise(tmp_path / "album", run)[0].T_world_camera is None
         return
     (tmp_path / "album" / where / "camera.yaml").write_text(lens.model_dump_json(exclude_none=True))
     (found,) = localise(tmp_path / "album" / given, run)

@@ -29,6 +29,7 @@ from slam.pipeline.observer import Observer
 from slam.pipeline.run import SlamPipeline
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SlamError
+from slam.sequences.camera_file import fixed_to, write_camera
 from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 
@@ -264,9 +265,16 @@ def test_images_without_a_camera_leave_one_for_the_next_run(
     assert camera.fx_sigma == UNKNOWN_FX_SIGMA and camera.source is not None
     assert camera.source in caplog.text and "cannot be seen" in camera.source
     caplog.clear()
-    again = run_slam(**given, camera=found, output=tmp_path / "second")
+    fixed = np.zeros((camera.height, camera.width), np.bool_)
+    fixed[-20:] = True
+    write_camera(found.parent, camera, fixed)
+    again = run_slam(**given, camera=found, output=tmp_path / "second").path
     assert "cannot be seen" not in caplog.text
-    assert read_camera_file(again.path / CAMERA_FILE) == camera
+    written = read_camera_file(again / CAMERA_FILE)
+    assert written.mask == str(again / "mask.png")
+    assert written == camera.model_copy(update={"mask": written.mask})
+    kept = fixed_to(written, None)
+    assert kept is not None and (kept == fixed).mean() > 0.97
 
 
 def test_arguments_are_those_of_a_request_one_by_one() -> None:

@@ -16,8 +16,9 @@ from slam.frontend import agreement
 from slam.frontend.drive import Drive, Segment
 from slam.frontend.lidar_odometry import LidarPath, lidar_steps
 from slam.frontend.measured import Measured, frame_support
+from slam.frontend.self_calibration import FoundCamera
+from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.motion import Motion
-from slam.frontend.visual.self_calibration import DepthError, FocalLength
 from slam.geometry import se3
 from slam.runtime.errors import Failed
 
@@ -95,7 +96,6 @@ def driven(
     on_road: int = FRAMES,
     segments: int = 1,
     contradicted: int = 0,
-    focal: float = 0.0,
     aside: int = 0,
     weak: int = 0,
     focal_sigma: float = 0.0,
@@ -109,7 +109,6 @@ def driven(
     drive = Drive(
         Measured(
             roads=[Failed("not asked")] * (FRAMES + 1),
-            focal_length=FocalLength(1e6, -1e6 * focal),
             below_is_nearer=[k >= turned for k in range(FRAMES)],
         ),
         steps=steps,
@@ -135,7 +134,6 @@ def driven(
         {"on_road": 10},
         {"segments": 2},
         {"contradicted": 2},
-        {"focal": np.log(1.3)},
         {"aside": 8},
         {"weak": 10},
         {"focal_sigma": 0.1},
@@ -149,20 +147,20 @@ def test_a_drive_whose_images_are_unlike_those_of_good_drives_is_doubtful(
     assert driven(**doubtful) < 0.5 < 0.9 < driven(weak=8)
 
 
-def test_a_guessed_focal_length_comes_with_the_one_that_corners_show() -> None:
-    sigma = 0.02
-    information = (4.0 / sigma) ** 2
-    found = FocalLength(information, -information * np.log(CAMERA.fx / 300.0))
-    guess = replace(CAMERA, fx=300.0, fy=300.0, focal_sigma=0.1)
-    said = agreement.of_focal_length(found, guess)
-    assert f"{100 * CAMERA.fx / 300.0:.0f} % of the given" in said.figure
-    calibrated = agreement.of_focal_length(found, replace(guess, focal_sigma=0.0))
-    assert calibrated is not None and "--camera auto" in calibrated.figure
+def found(ratio: float, sigma: float = 0.03) -> FoundCamera:
+    """A camera whose focal length is so many times that of `CAMERA`, by windows."""
+    focal = ratio * CAMERA.focal_half_widths
+    return FoundCamera(focal, (0.0, 0.0), (0.0, 0.0), sigma, 6, 60.0)
 
 
-def test_a_focal_length_that_nothing_measured_speaks_for_no_camera() -> None:
-    information = (4.0 / 0.25) ** 2
-    assert agreement.of_focal_length(FocalLength(information, 0.01 * information), CAMERA) is None
+def test_a_stated_focal_length_is_contradicted_beyond_three_sigmas_alone() -> None:
+    said = agreement.of_focal_length(found(1.15), CAMERA)
+    assert said is not None and said.sigmas > 3.0
+    assert "276 px" in said.figure and "try --camera auto" in said.figure
+    for agreeing in (found(1.08), found(1.5, sigma=0.35)):
+        assert agreement.of_focal_length(agreeing, CAMERA) is None
+    guess = agreement.of_focal_length(found(1.08), replace(CAMERA, focal_sigma=0.1))
+    assert guess is not None and guess.sigmas == 3.0 and guess.figure == "nobody calibrated it"
 
 
 @pytest.mark.parametrize(("sigma", "most"), [(0.03, 0.75), (0.06, 0.43), (0.35, 0.08)])

@@ -10,7 +10,7 @@ import pytest
 from slam.frames import DepthMap, Intrinsics
 from slam.frontend.ground_plane import GroundPlaneFitter
 from slam.frontend.scale import ScaleEstimate, scale_from_road
-from slam.frontend.visual.self_calibration import DepthError
+from slam.frontend.visual.depth_error import DepthError
 from slam.runtime.errors import Failed
 
 LEVEL_CAMERA = Intrinsics(416, 128, 240.0, 240.0, 207.5, 63.5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -10,7 +11,8 @@ import pytest
 
 from erfsfm.common.readers.camera_file import UNKNOWN_FX_SIGMA
 from slam.frames import Frame
-from slam.frontend.self_calibration import find_camera
+from slam.frontend.followed_corners import follow
+from slam.frontend.self_calibration import check_camera, find_camera
 from slam.simulation.options import SimulationOptions
 from slam.simulation.recording import simulated_world
 
@@ -25,8 +27,12 @@ def images(options: SimulationOptions, first: int, last: int) -> Iterator[Frame]
 
 
 def test_a_street_that_turns_shows_its_focal_length() -> None:
-    true_focal = simulated_world(STREET).camera.fx / (WIDTH / 2)
-    found = find_camera(images(STREET, 40, 74))
+    camera = simulated_world(STREET).camera
+    wrong, true_focal = replace(camera, fx=1.25 * camera.fx), camera.focal_half_widths
+    seen = follow(images(STREET, 40, 74))
+    found = check_camera(seen, wrong)
+    assert found.sigmas_from(wrong) > 3.0
+    assert check_camera(seen, camera).sigmas_from(camera) < 3.0
     assert found.focal == pytest.approx(true_focal, rel=0.04)
     assert found.sigma < 0.05 and found.turn_deg > 20
     said = found.sentence(WIDTH)

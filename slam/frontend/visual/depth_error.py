@@ -1,14 +1,10 @@
-"""What the corners of a drive show of its error of learned depth over distance, and of the focal length that is stated.
+"""What the corners of a drive show of its error of learned depth over distance.
 
 Networks see far things too near, and err more the farther they are: on streets that they were not
 trained on by a third beyond 40 m. One scale for all distances would then depend on whether most
 corners are near or far. So the logarithm of learned over triangulated depth is counted by learned
 depth; its median is the bias that is taken out before depth is compared with anything, its spread
 without that of triangulation the sigma (``docs/design/visual-front-end.md``).
-
-Under a wrong focal length no motion explains the corners of a camera that turns: the essential
-matrix of wrong rays has two singular values that differ (Hartley and Zisserman 2004, section 9.6).
-A camera that goes straight on shows nothing.
 """
 
 from __future__ import annotations
@@ -21,9 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import DepthMap
-from slam.frontend.visual.two_view import Residuals, tangent_of
-from slam.geometry.multiview import UnitRelativePose
-from slam.geometry.robust import mad_sigma, weighted_median
+from slam.geometry.robust import weighted_median
 from slam.geometry.se3 import FloatArray
 
 # learned depth is counted in half octaves, in the unit of the networks
@@ -42,10 +36,6 @@ _USUAL_FAR_SIGMA = 0.25
 # no error of learned depth
 _LEAST_RATIO = float(np.exp(_LOGARITHMS[0]))
 _SURE_SIGMAS = 2.0
-_FOCAL_STEP = 0.01  # of the logarithm, for its derivative
-_LEAST_SIGMA_PX = 1e-3
-# of the errors of corners, and of those that flow makes where a camera hardly turns
-_CORRELATION = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,49 +159,3 @@ def _nearest(values: FloatArray, places: NDArray[np.floating[Any]]) -> NDArray[n
     """Row of the nearest of evenly spaced ``places`` ``(P,)`` for values ``(M,)``, beyond its ends the last."""
     rows = np.rint((values - places[0]) / (places[1] - places[0]))
     return np.asarray(np.clip(rows, 0, len(places) - 1), np.int64)
-
-
-@dataclass(frozen=True)
-class FocalLength:
-    """What the steps of a drive say of the logarithm of true over stated focal length: information and gradient."""
-
-    information: float = 0.0
-    gradient: float = 0.0
-
-    @property
-    def error(self) -> tuple[float, float] | None:
-        """The logarithm and its sigma, linear in a small error; None where nothing turned."""
-        if self.information <= 0:
-            return None
-        return -self.gradient / self.information, _CORRELATION / float(np.sqrt(self.information))
-
-    def with_step(
-        self,
-        rays_previous: FloatArray,
-        rays_current: FloatArray,
-        unit_pose: UnitRelativePose,
-        focal_px: float,
-    ) -> Self:
-        """After one more step, whose rotation and direction are eliminated.
-
-        By the rays ``(M, 3)``, z = 1, of corners on their epipolar lines; ``focal_px`` is the
-        stated focal length.
-        """
-        tangent, unknown = tangent_of(unit_pose.direction), np.full(len(rays_previous), np.nan)
-
-        def across(ratio: float) -> tuple[FloatArray, FloatArray]:
-            scale = np.array([1.0 / ratio, 1.0 / ratio, 1.0])
-            residuals = Residuals(
-                rays_previous * scale, rays_current * scale, unknown, focal_px * ratio
-            )
-            return residuals.across(unit_pose, tangent)
-
-        residual, by_motion = across(1.0)
-        by_focal = (across(1.0 + _FOCAL_STEP)[0] - residual) / np.log1p(_FOCAL_STEP)
-        sigma = max(mad_sigma(residual), _LEAST_SIGMA_PX)
-        weights = 1.0 / (sigma**2 * (1.0 + (residual / (2.0 * sigma)) ** 2))
-        weighted = by_motion * weights
-        normal = weighted @ by_motion.T + 1e-9 * np.eye(len(by_motion))
-        explained = by_focal - np.linalg.solve(normal, weighted @ by_focal) @ by_motion
-        information, gradient = (float(explained @ (weights * by)) for by in (by_focal, residual))
-        return type(self)(self.information + information, self.gradient + gradient)

@@ -40,10 +40,10 @@ def test_seeds_on_the_simulated_street(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("recording", "mean_m"),
     [
-        ("handheld_walk", 0.130),
+        # 0.057, 0.105 and 0.214 were measured, which spread by too much
+        pytest.param("handheld_walk", 0.125, marks=pytest.mark.xfail(strict=True)),
         ("handheld_kitchen", 0.0258),
-        # 0.190, 0.149 and 0.366 were measured, which spread by too much
-        pytest.param("failures/tum_cabinet", 0.235, marks=pytest.mark.xfail(strict=True)),
+        ("failures/tum_cabinet", 0.153),
     ],
 )
 def test_seeds_of_a_carried_camera(

@@ -56,8 +56,8 @@ _TURNING = 0.5  # radians beyond which turns are told without the focal length
 _INFLATED, _FLOOR, _SYSTEMATIC = 3.0, 0.03, 0.02
 _BY_TURN = 0.3  # sigma of a window that turns by one degree; less, as it turns more
 _HUBER = 1.5
-# of a stated camera: points of one window, with which a check takes a second, and sigmas beyond which all are asked
-_CHECKED, _DOUBTFUL = 120, 2.0
+# of a stated camera: points of a window, which takes a second, and sigmas beyond which the next one is asked
+_CHECKED, _DOUBTFUL = 120, 1.5
 
 
 @dataclass(frozen=True)
@@ -122,15 +122,18 @@ def find_camera(frames: Iterable[Frame]) -> FoundCamera:
 def check_camera(seen: FollowedCorners, stated: Intrinsics) -> FoundCamera:
     """The camera by the corners that a drive followed, measured from the principal point of the ``stated`` one.
 
-    A few of one window are asked, and all where they contradict it.
+    A few of one window are asked, and those of the next one while they contradict it or tell it roughly.
     """
-    windows = windows_that_turn(seen)
-    few = []
-    for window in windows[:1]:
+    told: list[Window | None] = []
+    found = joined(told)
+    for window in windows_that_turn(seen):
         longest = np.argsort(-np.bincount(window.point), kind="stable")[:_CHECKED]
-        few.append(window.chosen(np.isin(window.point, longest), least=2)[0])
-    found = joined(map(calibrated, few))
-    return found if found.sigmas_from(stated) < _DOUBTFUL else joined(map(calibrated, windows))
+        told.append(calibrated(window.chosen(np.isin(window.point, longest), least=2)[0]))
+        found = joined(told)
+        is_rough = SURE < found.sigma <= ROUGH
+        if found.sigmas_from(stated) < _DOUBTFUL and not is_rough:
+            break
+    return found
 
 
 @dataclass(frozen=True)

@@ -315,6 +315,7 @@ def assert_same(one: Observer, other: Observer) -> None:
     assert first.unusable == second.unusable and first.failures == second.failures
 
 
+@pytest.mark.slow
 def test_a_camera_that_moves_too_little_to_be_told_from_the_frame_before_does_not_stand(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

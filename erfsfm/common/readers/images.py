@@ -6,6 +6,7 @@ import logging
 import math
 import re
 import struct
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -195,7 +196,7 @@ def decode_values(data: bytes, where: str, flags: int = cv2.IMREAD_UNCHANGED) ->
     if not data:
         raise DataError(f"{where} is empty: copy it again")
     if not _is_complete(data):
-        raise DataError(f"{where} is truncated at {len(data)} bytes: copy it again")
+        raise DataError(f"{where} is truncated or damaged: copy it again")
     too_many = DataError(f"{where} has more pixels than any camera: resize it, or leave it out")
     # the header is asked, for few kilobytes may unpack to gigabytes
     if _stored_pixels(data) > MOST_PIXELS:
@@ -282,12 +283,19 @@ def _file_bytes(path: Path) -> bytes:
 
 
 def _is_complete(data: bytes) -> bool:
-    """Whether a JPEG or PNG file reaches its end marker; some decoders fill what is missing with grey.
+    """Whether a JPEG or PNG file reaches its end, a PNG with all its checksums; some decoders fill in grey.
 
     The segments of a JPEG lead there; phones put a video behind it, with bytes of any value.
     """
     if data.startswith(_PNG_START):
-        return data.rfind(_PNG_END) > 0
+        place, kind = _PNG_SIZE_AT - 8, b""
+        while kind != _PNG_END and place + 8 < len(data):
+            end = place + 8 + int.from_bytes(data[place : place + 4], "big")
+            kind = data[place + 4 : place + 8]
+            if zlib.crc32(data[place + 4 : end]).to_bytes(4, "big") != data[end : end + 4]:
+                return False
+            place = end + 4
+        return kind == _PNG_END
     is_jpeg = data.startswith(_JPEG_START)
     return not is_jpeg or any(marker == _JPEG_END for marker, _ in _segments(data))
 

@@ -68,6 +68,19 @@ def test_one_stretch_serves_a_whole_recording(tmp_path: Path) -> None:
     assert stretch_of(paths, read_values) is None
 
 
+def test_a_flipped_bit_of_a_png_is_one_line_and_no_words_of_libpng(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "0.png"
+    cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8))
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 4
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=r"0\.png is truncated or damaged"):
+        read_image(path)
+    assert capfd.readouterr() == ("", "")
+
+
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 @pytest.mark.parametrize("keep", [0.0, 0.97])
 def test_truncated_image_is_named(tmp_path: Path, suffix: str, keep: float) -> None:

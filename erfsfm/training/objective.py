@@ -174,9 +174,8 @@ class Level:
     sources: Tensor  # (B, N, 3, h, w)
     K: Tensor
     disparity: Tensor  # (B, 1, h, w)
-    seen: Tensor | None = (
-        None  # (B, 1, h, w), 0 where something fixed to the camera hides the world
-    )
+    # (B, 1, h, w), 0 where something fixed to the camera hides the world
+    seen: Tensor | None = None
 
     @staticmethod
     def of(batch: SnippetBatch, disparity: Tensor, config: ExperimentConfig) -> Level:

@@ -18,6 +18,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import compress
 from typing import Literal, NamedTuple
 
@@ -181,6 +182,7 @@ def find_scale(unit: Unit, drive: Drive, lidar_steps: Sequence[RelativePose] = (
     absolute = _absolute_lengths(drive.road_steps, height, lidar_steps)
     by_planes = scale_from_road(drive.measured.roads, height)
     steps = links(motions, frames)
+    firsts = [first for first, _ in steps]
     if isinstance(by_planes, Failed):
         both = motions.keys() & absolute.keys()
         ratios = [absolute[ends][0] / motions[ends].length_unscaled for ends in both]
@@ -190,15 +192,15 @@ def find_scale(unit: Unit, drive: Drive, lidar_steps: Sequence[RelativePose] = (
     evidence = gather_evidence(steps, drive.steps, absolute, prior_unit)
     if not isinstance(by_planes, Failed):
         # a car ahead taken for the road for seconds would outweigh all other measurements
-        most = np.log(_MAX_CONTRADICTION) * min(evidence.learned_noise(), _MOST_NOISE_BESIDE_ROAD)
+        most = np.log(_MAX_CONTRADICTION) * min(evidence.learned_noise, _MOST_NOISE_BESIDE_ROAD)
         evidence.absolute[np.abs(evidence.absolute - evidence.learned) > most] = np.nan
-        planes = _ratios(drive.measured.roads, height)[[first for first, _ in steps]]
+        planes = _ratios(drive.measured.roads, height)[firsts]
         evidence.plane[:] = np.log(planes / by_planes.value)
         over_prior = evidence.absolute - evidence.learned
         if np.isfinite(over_prior).any():  # rain biases the learned plane: its changes alone count
             evidence.plane[:] += np.nanmedian(over_prior)
     solved = solve_lengths(evidence, height)
-    row_at = np.searchsorted([first for first, _ in steps], np.arange(frames), side="right") - 1
+    row_at = np.searchsorted(firsts, np.arange(frames), side="right") - 1
     unit_correction = solved.unit_correction
     if drive.by_keyframes:  # maps have the unit of learned depth, one along the drive
         unit_correction = np.full_like(unit_correction, np.median(unit_correction))
@@ -293,6 +295,7 @@ class StepEvidence:
     plane: FloatArray
     seconds: FloatArray
 
+    @cached_property
     def learned_noise(self) -> float:
         """How much more learned lengths err than on the roads that the network knows, at least 1.
 
@@ -334,7 +337,7 @@ class StepEvidence:
         """
         unit_before = np.concatenate([log_unit[:1], log_unit[:-1]])
         by_learned = self.learned + unit_before - log_length
-        by_learned /= self.learned_noise() * _LEARNED_SIGMA
+        by_learned /= self.learned_noise * _LEARNED_SIGMA
         change = np.diff(log_length) - np.diff(np.log(self.seconds))
         by_speed = np.concatenate([[np.nan], change / np.hypot(speed_sigma, _LENGTH_SIGMA)])
         worst = np.fmax(np.abs(by_learned), np.abs(by_speed))
@@ -411,7 +414,7 @@ def solve_lengths(evidence: StepEvidence, camera_height: float = 1.0) -> StepLen
     steps = len(evidence.learned)
     lengths, units = 2 * np.arange(steps), 2 * np.arange(steps) + 1
     ratio_sigma = np.hypot(_RATIO_WIDENING * evidence.ratio_sigma, _RATIO_SIGMA)
-    noise = evidence.learned_noise()
+    noise = evidence.learned_noise
     beside_road = np.where(np.isfinite(evidence.absolute), _BESIDE_ROAD, 1.0)
     ones = np.ones(steps)
     steady = np.diff(np.log(evidence.seconds))

@@ -215,7 +215,7 @@ class DepthPosePredictor:
         Raises:
             CheckpointError: there is no depth network, or its output is not finite.
         """
-        return np.asarray(self._output("depth", self.prepare(image))[0])
+        return self._output("depth", self.prepare(image))[0]
 
     def poses(
         self, images: Sequence[NDArray[np.uint8] | Array], camera: Pinhole | None = None

@@ -168,9 +168,9 @@ def _fitted(
 
 def _halfway(R: Array) -> Array:
     """A step's translation from that in the camera halfway, whose axes are the means of those of both cameras."""
-    return np.asarray((np.eye(3) + R) / 2)
+    return (np.eye(3) + R) / 2
 
 
 def _turned(R: Array, vectors: Array) -> Array:
     """Matrices ``(N, M, 3)`` times vectors ``(N, 3)``."""
-    return np.asarray((R @ vectors[..., None])[..., 0])
+    return (R @ vectors[..., None])[..., 0]

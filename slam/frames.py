@@ -410,6 +410,4 @@ def slopes_of(image: NDArray[np.float32]) -> list[NDArray[np.float32]]:
 def _nearest(
     values: NDArray[np.float32], u: NDArray[np.float32], v: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    return np.asarray(
-        cv2.remap(values, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE), np.float32
-    )
+    return cv2.remap(values, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)

@@ -81,7 +81,7 @@ class DriveLabels:
     def T_world_camera(self) -> NDArray[np.float64]:
         """Poses ``(N, 4, 4)`` in camera heights."""
         poses = np.load(self.poses_file, allow_pickle=False)
-        return np.asarray(poses[self.skipped : self.skipped + len(self.recording)])
+        return poses[self.skipped : self.skipped + len(self.recording)]
 
     @property
     def poses_file(self) -> Path:
@@ -255,9 +255,7 @@ class DriveLabels:
 
     def _motion(self, target: int, others: Iterable[int]) -> NDArray[np.float64]:
         """``T_other_target`` ``(N, 4, 4)``."""
-        return np.asarray(
-            np.linalg.inv(self.T_world_camera[[*others]]) @ self.T_world_camera[target]
-        )
+        return np.linalg.inv(self.T_world_camera[[*others]]) @ self.T_world_camera[target]
 
     def _image(self, index: int, camera: Camera) -> NDArray[np.uint8] | None:
         """A frame at a camera's size; None where it cannot be read."""
@@ -385,4 +383,4 @@ class ManyViewTeacher:
 
 
 def _grey(image: NDArray[np.uint8]) -> Grey:
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)

@@ -169,9 +169,7 @@ class Recording:
         """As `true_depth` of a frame that has it, by the nearest pixels at another size, of ``image`` as a rule."""
         depth_m = self.true_depth(index)
         assert depth_m is not None, "the frame has depth"
-        return np.asarray(
-            cv2.resize(depth_m, (width, height), interpolation=cv2.INTER_NEAREST_EXACT), np.float32
-        )
+        return cv2.resize(depth_m, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
 
     def true_poses(self, fidelity: Fidelity = "default") -> NDArray[np.float64] | None:
         """``T_world_camera`` ``(N, 4, 4)``, or None where the recording has no poses.

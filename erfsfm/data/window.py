@@ -59,7 +59,7 @@ def snippet_motion(
     """``T_source_target`` ``(N, 4, 4)`` of the snippet that begins at pose ``first`` of ``(frames, 4, 4)``."""
     target = first + sources // 2
     others = np.delete(np.arange(first, first + sources + 1), sources // 2)
-    return np.asarray(np.linalg.inv(T_world_camera[others]) @ T_world_camera[target])
+    return np.linalg.inv(T_world_camera[others]) @ T_world_camera[target]
 
 
 def load_window(cache: ArrayCache, snippet: Snippet, length: int) -> list[NDArray[np.uint8]]:
@@ -139,4 +139,4 @@ class ArrayCache:
         if block == len(self._blocks):
             arrays = min(_BLOCK, self._capacity - slot)
             self._blocks.append(np.empty((arrays, *self.shape), self._dtype))
-        return np.asarray(self._blocks[block][row])
+        return self._blocks[block][row]

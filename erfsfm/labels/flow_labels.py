@@ -99,7 +99,7 @@ def sky_mask(grey: Grey, horizon: tuple[float, float]) -> NDArray[np.bool_]:
     below = np.unique(component[int(np.clip(horizon[1] + BELOW_HORIZON * height, 0, height)) :])
     ahead = slice(*(int(max(horizon[0] + side * SKY_AHEAD * width, 0)) for side in (-1, 1)))
     over_road = np.intersect1d(component[0], component[:, ahead])
-    return np.asarray(np.isin(component, np.setdiff1d(over_road, [0, *below])))
+    return np.isin(component, np.setdiff1d(over_road, [0, *below]))
 
 
 def measure(

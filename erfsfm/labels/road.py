@@ -78,7 +78,7 @@ def road_plane(
         if len(on_plane) < max(LEAST_POINTS, LEAST_RATIO * len(flat)):
             return None
         line = np.linalg.lstsq(on_plane, np.ones(len(on_plane)), rcond=None)[0]
-    return np.asarray(line[0] * across + line[1] * down)
+    return line[0] * across + line[1] * down
 
 
 def on_road(inverse_depth: Array, known: NDArray[np.bool_], road: Array) -> NDArray[np.bool_]:
@@ -90,13 +90,13 @@ def on_road(inverse_depth: Array, known: NDArray[np.bool_], road: Array) -> NDAr
     agreeing_share = _mean_around(agreeing, window)
     level = (road > 0) & (known_share > LEAST_AROUND)
     level &= agreeing_share > LEAST_AGREEING * known_share
-    return np.asarray(level & ~(known & (np.abs(inverse_depth - road) > NEAR * road)))
+    return level & ~(known & (np.abs(inverse_depth - road) > NEAR * road))
 
 
 def _mean_around(mask: NDArray[np.bool_], window: tuple[int, int]) -> Array:
     """Share of the window ``(width, height)`` around each pixel that a mask holds, ``(H, W)``."""
     share = cv2.blur(mask.astype(np.float32), window, borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(share, np.float32)
+    return share
 
 
 def under_road(inverse_depth: Array, sigma: Array, road: Array) -> NDArray[np.bool_]:
@@ -106,7 +106,7 @@ def under_road(inverse_depth: Array, sigma: Array, road: Array) -> NDArray[np.bo
     """
     under = (road > 0) & (inverse_depth + SIGMAS_UNDER * sigma < (1 - NEAR) * road)
     rim = np.ones((RIM_PX, RIM_PX), np.uint8)
-    return np.asarray((cv2.dilate(under.astype(np.uint8), rim) > 0) & (road > 0))
+    return (cv2.dilate(under.astype(np.uint8), rim) > 0) & (road > 0)
 
 
 def impose_road(

@@ -124,4 +124,4 @@ def _of_costs(costs: Costs, coarse: Array) -> Array:
 def _quartered(part: Array, h: int, w: int) -> Array:
     """Blocks of 2x2 pixels as four channels ``(4, h, w)``, by row, then by column."""
     blocks = part[: 2 * h, : 2 * w].astype(np.float32).reshape(h, 2, w, 2)
-    return np.asarray(blocks.transpose(1, 3, 0, 2).reshape(4, h, w))
+    return blocks.transpose(1, 3, 0, 2).reshape(4, h, w)

@@ -72,17 +72,14 @@ def _differences(
 def warped(image: Array, u: Array, v: Array) -> Array:
     """An image at other pixels; very large outside of it."""
     outside = (_OUTSIDE,) * 4
-    return np.asarray(
-        cv2.remap(
-            image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=outside
-        ),
-        np.float32,
+    return cv2.remap(
+        image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=outside
     )
 
 
 def is_inside(levels: Array) -> NDArray[np.bool_]:
     """Which of the levels that ``warped`` gave lie inside of the image."""
-    return np.asarray(np.abs(levels) < _OUTSIDE / 100)
+    return np.abs(levels) < _OUTSIDE / 100
 
 
 def lowest(costs: Costs) -> Array:
@@ -103,7 +100,7 @@ def smoothed(costs: Costs, grey: Array) -> Costs:
     """
     by_row = _both_ways(costs.transpose(1, 0, 2), _penalties(grey))  # (h, C, w)
     by_column = _both_ways(costs.transpose(2, 0, 1), _penalties(grey.T))  # (w, C, h)
-    return np.asarray(by_row.transpose(1, 0, 2) + by_column.transpose(1, 2, 0))
+    return by_row.transpose(1, 0, 2) + by_column.transpose(1, 2, 0)
 
 
 def _penalties(grey: Array) -> Costs:
@@ -129,4 +126,4 @@ def _both_ways(volume: Costs, penalties: Costs) -> Costs:
         np.minimum(path, large, out=path)
         row += path
         row -= row.min(axis=0)
-    return np.asarray(down_up[..., :width] + down_up[::-1, :, width:])
+    return down_up[..., :width] + down_up[::-1, :, width:]

@@ -51,9 +51,7 @@ def normalised(grey: Array) -> Array:
     """Grey levels ``(H, W)`` minus their local mean, over their local standard deviation."""
     mean = cv2.GaussianBlur(grey, (0, 0), NEIGHBOURHOOD_PX)
     variance = cv2.GaussianBlur(grey * grey, (0, 0), NEIGHBOURHOOD_PX) - mean * mean
-    return np.asarray(
-        (grey - mean) / (np.sqrt(np.maximum(variance, 0)) + np.float32(CONTRAST_FLOOR)), np.float32
-    )
+    return (grey - mean) / (np.sqrt(np.maximum(variance, 0)) + np.float32(CONTRAST_FLOOR))
 
 
 def neighbours(

@@ -29,7 +29,7 @@ class TorchNetwork:
     def __call__(self, *inputs: Array | list[Array]) -> Array:
         """The network's output for arrays, and lists of arrays."""
         output: Tensor = self._network(*tensors(inputs, self._device))
-        return np.asarray(output.float().cpu().numpy())
+        return output.float().cpu().numpy()
 
 
 def tensors(

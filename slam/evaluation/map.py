@@ -366,7 +366,7 @@ def _to_map(samples: FloatArray, points: FloatArray) -> FloatArray:
         return np.empty(0)
     low, high = samples.min(axis=0) - OUTLIER_M, samples.max(axis=0) + OUTLIER_M
     near = points[((points >= low) & (points <= high)).all(axis=1)]
-    return np.asarray(cKDTree(near).query(samples, distance_upper_bound=OUTLIER_M)[0])
+    return cKDTree(near).query(samples, distance_upper_bound=OUTLIER_M)[0]
 
 
 def double_wall_share(pieces: Iterable[tuple[FloatArray, NDArray[np.int64]]]) -> float:

@@ -176,4 +176,4 @@ def _rotations(T_estimate: FloatArray, T_reference: FloatArray) -> list[str]:
 def _turns(T_world_camera: FloatArray) -> FloatArray:
     """Rotation vectors ``(N - 1, 3)`` of the camera from row to row, in its own axes."""
     R = T_world_camera[:, :3, :3]
-    return np.asarray(Rotation.from_matrix(np.swapaxes(R[:-1], 1, 2) @ R[1:]).as_rotvec())
+    return Rotation.from_matrix(np.swapaxes(R[:-1], 1, 2) @ R[1:]).as_rotvec()

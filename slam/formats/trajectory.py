@@ -318,7 +318,7 @@ def nearest_stamps(stamps: FloatArray, candidates: FloatArray) -> NDArray[np.int
     if len(candidates) == 1:
         return np.zeros(len(stamps), dtype=np.intp)
     before_is_nearer = stamps - candidates[after - 1] <= candidates[after] - stamps
-    return np.asarray(np.where(before_is_nearer, after - 1, after))
+    return np.where(before_is_nearer, after - 1, after)
 
 
 def _read_numbers(

@@ -164,20 +164,20 @@ def _beyond_edge(length: _Layer, world: Mask) -> Mask:
     through = onward + back[::-1] - rise.T  # of the path through each pixel with the largest sum
     below = np.arange(len(length))[:, None] >= first + through.argmax(axis=1)
     is_edge = through.max() > _LEAST_RISE * rise.shape[1] and world[below].mean() < _PASSES
-    return np.asarray(below & is_edge)
+    return below & is_edge
 
 
 def _best_sums(sums: _Layer, column: _Layer) -> _Layer:
     """Sums ``(h,)`` along the best paths to each pixel of a column, by those to the column before."""
     around = np.pad(sums, 1, constant_values=-np.inf)
     bent = np.maximum(around[:-2], around[2:]) - _BEND
-    return np.asarray(column + np.maximum(bent, sums))
+    return column + np.maximum(bent, sums)
 
 
 def _local(grey: Grey) -> _Layer:
     """The image in a smaller size, without what changes slowly over it."""
     small = shrunk(grey, math.ceil(grey.shape[1] / _WIDTH_PX))
-    return np.asarray(small - cv2.GaussianBlur(small, (0, 0), _LOCAL_PX), np.float32)
+    return small - cv2.GaussianBlur(small, (0, 0), _LOCAL_PX)
 
 
 def _towards_middle(shape: tuple[int, ...]) -> tuple[_Layer, _Layer]:

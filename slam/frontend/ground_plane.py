@@ -112,7 +112,7 @@ def _inliers(rays: FloatArray, inverse_depth: FloatArray, planes: FloatArray) ->
     over_measured = (rays / inverse_depth[:, None]).T.astype(np.float32)
     relative = planes.astype(np.float32) @ over_measured
     relative -= 1.0
-    return np.asarray(np.abs(relative, out=relative) < _INLIER_RELATIVE_DEPTH)
+    return np.abs(relative, out=relative) < _INLIER_RELATIVE_DEPTH
 
 
 def _reweighted(rays: FloatArray, inverse_depth: FloatArray, plane: FloatArray) -> FloatArray:

@@ -199,7 +199,7 @@ class RoadHomography:
         points = _ahead(R @ rays + _LENGTHS_HEIGHTS[:, None, None] * shift)
         difference = self._sampled(before, points)[..., 0] - seen
         costs = np.minimum(np.abs(difference), _CLIPPED_GREY).mean(axis=1)
-        return np.asarray(_LENGTHS_HEIGHTS[int(np.argmin(costs))] * normal)
+        return _LENGTHS_HEIGHTS[int(np.argmin(costs))] * normal
 
     def _refine(
         self,
@@ -318,7 +318,7 @@ class _Strip:
         grid = np.zeros_like(self.coverage)
         grid[self.places] = grey
         blurred = cv2.GaussianBlur(grid, (0, 0), self.gradual)
-        return np.asarray(grey - blurred[self.places] / self.coverage[self.places])
+        return grey - blurred[self.places] / self.coverage[self.places]
 
 
 def _strip(
@@ -359,7 +359,7 @@ def _normal_along(direction: FloatArray) -> FloatArray:
     """The normal ``(3,)`` of a road, down, unit, that is level across a ``direction`` ``(3,)`` and parallel to it."""
     along = direction / max(float(np.linalg.norm(direction)), 1e-9)
     normal = _LEVEL - (_LEVEL @ along) * along
-    return np.asarray(normal / np.linalg.norm(normal))
+    return normal / np.linalg.norm(normal)
 
 
 def _solved(
@@ -368,7 +368,7 @@ def _solved(
     """The plane ``m`` ``(3,)`` of normal equations and an expected normal, at about that length."""
     across = np.eye(3) - np.outer(normal, normal)
     prior = across / (np.deg2rad(_TILT_SIGMA_DEG) * max(length, 1e-6)) ** 2
-    return np.asarray(np.linalg.solve(information + prior + 1e-9 * np.eye(3), right))
+    return np.linalg.solve(information + prior + 1e-9 * np.eye(3), right)
 
 
 def _gradual_px(intrinsics: Intrinsics) -> float:

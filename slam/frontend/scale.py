@@ -323,7 +323,7 @@ class StepEvidence:
         speed = np.exp(np.where(is_known, log_speed, median(log_speed[is_known])))
         duration = 0.5 * (self.seconds[1:] + self.seconds[:-1])
         change = _ACCELERATION_SIGMA * camera_height * duration
-        return np.asarray(change / np.maximum(speed[1:], speed[:-1]))
+        return change / np.maximum(speed[1:], speed[:-1])
 
     def contradicted(
         self, log_length: FloatArray, log_unit: FloatArray, speed_sigma: FloatArray
@@ -341,7 +341,7 @@ class StepEvidence:
         change = np.diff(log_length) - np.diff(np.log(self.seconds))
         by_speed = np.concatenate([[np.nan], change / np.hypot(speed_sigma, _LENGTH_SIGMA)])
         worst = np.fmax(np.abs(by_learned), np.abs(by_speed))
-        return np.asarray(worst > _CONTRADICTION_SIGMAS)
+        return worst > _CONTRADICTION_SIGMAS
 
     @classmethod
     def empty(cls, steps: int) -> StepEvidence:

@@ -147,7 +147,7 @@ class Reconstruction:
     @property
     def turns(self) -> FloatArray:
         """Rotation vectors of the cameras ``(K, 3)``."""
-        return np.asarray(Rotation.from_matrix(self.T_camera_world[:, :3, :3]).as_rotvec())
+        return Rotation.from_matrix(self.T_camera_world[:, :3, :3]).as_rotvec()
 
     def stretched(self, ratio: float) -> Reconstruction:
         """The same images under a focal length so many times as long, to first order in the turns."""
@@ -324,7 +324,7 @@ class Problem:
         return np.exp(given.lens[0]) * X[:, :2] / np.maximum(X[:, 2:], LEAST_DEPTH), X
 
     def _squares(self, given: Reconstruction, sigma: float) -> FloatArray:
-        return np.asarray((self.errors(given) ** 2).sum(axis=1) / sigma**2)
+        return (self.errors(given) ** 2).sum(axis=1) / sigma**2
 
     def _cost(self, given: Reconstruction, sigma: float) -> float:
         robust = _CAUCHY * np.log1p(self._squares(given, sigma) / _CAUCHY)
@@ -441,8 +441,8 @@ def _bent(ideal: FloatArray, lens: FloatArray) -> tuple[FloatArray, FloatArray, 
 def _sums(values: FloatArray, groups: NDArray[np.int64], count: int) -> FloatArray:
     """Sums ``(count, ...)`` of the values ``(S, ...)`` of each group ``(S,)``."""
     own = csr_array((np.ones(len(groups)), (groups, np.arange(len(groups)))), (count, len(groups)))
-    return np.asarray((own @ values.reshape(len(values), -1)).reshape(count, *values.shape[1:]))
+    return (own @ values.reshape(len(values), -1)).reshape(count, *values.shape[1:])
 
 
 def _normalised(vectors: FloatArray) -> FloatArray:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

@@ -183,7 +183,7 @@ def new_corners(
                 tiles.append(corners.reshape(-1, 2) + np.array([left, top], np.float32))
                 ranks.append(before + np.arange(len(corners)))
     order = np.argsort(np.concatenate(ranks), kind="stable")[:count]
-    return np.asarray(np.concatenate(tiles)[order])
+    return np.concatenate(tiles)[order]
 
 
 def _away_from(pixels: Pixels, radius: int, shape: tuple[int, ...]) -> NDArray[np.uint8]:
@@ -352,10 +352,8 @@ class PredictedFlow:
 
     def warp_back(self, current: Grey) -> Grey:
         """The later image ``(H, W)`` warped to the earlier one, equal to it where the prediction is right."""
-        return np.asarray(
-            cv2.remap(
-                current, self._current, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
-            )
+        return cv2.remap(
+            current, self._current, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
         )
 
     def in_current(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -426,7 +424,7 @@ class PredictedFlow:
         )
         ahead = cv2.max(z, _NEAREST)
         flow = cv2.merge([cv2.divide(x, ahead) - u, cv2.divide(y, ahead) - v[:, None]])
-        return np.asarray(cv2.resize(flow, (width, height)) + _pixels(self.intrinsics))
+        return cv2.resize(flow, (width, height)) + _pixels(self.intrinsics)
 
 
 @lru_cache(maxsize=2)

@@ -376,7 +376,7 @@ def parallax_px(
     rotated = rays_previous @ R_current_previous.T
     rotated = rotated[:, :2] / np.where(rotated[:, 2:] > 1e-6, rotated[:, 2:], 1e-6)
     difference = (rays_current[:, :2] - rotated) * focal
-    return np.asarray(np.linalg.norm(difference, axis=1))
+    return np.linalg.norm(difference, axis=1)
 
 
 def rotation_between(rays_previous: FloatArray, rays_current: FloatArray) -> FloatArray:
@@ -403,7 +403,7 @@ def triangulated_depth(
     From ``z R x + t = z' x'``: the cross product with x' leaves ``z (x' x R x) = -(x' x t)``.
     """
     across, along = _across_and_along(rays_previous, rays_current, unit_pose)
-    return np.asarray((across * along).sum(axis=0) / np.maximum((across**2).sum(axis=0), 1e-18))
+    return (across * along).sum(axis=0) / np.maximum((across**2).sum(axis=0), 1e-18)
 
 
 def triangulated_nearness(
@@ -433,7 +433,7 @@ def depth_in_current(
     rays_previous: FloatArray, depth_previous: FloatArray, unit_pose: UnitRelativePose
 ) -> FloatArray:
     """z-depth ``(M,)`` in the current camera of points at ``depth_previous`` ``(M,)``, both in the motion's length."""
-    return np.asarray(
+    return (
         depth_previous * (rays_previous @ unit_pose.R_current_previous[2]) + unit_pose.direction[2]
     )
 

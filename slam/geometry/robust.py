@@ -39,7 +39,7 @@ def running_median(values: FloatArray, window: int) -> FloatArray:
     padded = np.pad(values, window // 2, constant_values=np.nan)
     around = np.sort(np.lib.stride_tricks.sliding_window_view(padded, window))  # NaN is last
     rows, known = np.arange(len(values)), (~np.isnan(around)).sum(axis=1)
-    return np.asarray(0.5 * (around[rows, (known - 1) // 2] + around[rows, known // 2]))
+    return 0.5 * (around[rows, (known - 1) // 2] + around[rows, known // 2])
 
 
 def difference_equations(

@@ -106,7 +106,7 @@ def rigid(T_a_b: FloatArray) -> FloatArray:
 
 def rotation_matrix(rotation_vector: FloatArray) -> FloatArray:
     """``R_a_b`` ``(3, 3)`` from one axis times angle in radians ``(3,)``, in a twentieth of the time of SciPy's."""
-    return np.asarray(cv2.Rodrigues(rotation_vector)[0])
+    return cv2.Rodrigues(rotation_vector)[0]
 
 
 def from_rotation_vector(rotation_vector: FloatArray, t_a_b: FloatArray) -> FloatArray:

@@ -181,7 +181,7 @@ class PoseGraph:
             raise SlamError(
                 f"no frame {frame} in the pose graph: it has 0 to {len(T_world_camera) - 1}"
             )
-        return np.asarray(self._marginals().marginalCovariance(frame))
+        return self._marginals().marginalCovariance(frame)
 
     def drift(self) -> float:
         """Sigma of the positions over the path, root mean square of frames spread over it.
@@ -293,7 +293,7 @@ def whitened_squared(
 def _outlying(squared: FloatArray) -> NDArray[np.bool_]:
     """Which whitened squared residuals ``(F,)`` are large, and far above the median as well."""
     typical = float(np.median(np.sqrt(squared))) if len(squared) else 0.0
-    return np.asarray(squared > max(_LARGEST_RESIDUAL, _OUTLYING * typical) ** 2)
+    return squared > max(_LARGEST_RESIDUAL, _OUTLYING * typical) ** 2
 
 
 def _check_connected(relative_poses: Sequence[RelativePose], count: int) -> None:

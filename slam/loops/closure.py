@@ -121,7 +121,7 @@ def close_loops(
 
     def apart(rows: NDArray[np.intp]) -> NDArray[np.bool_]:
         is_later = frames[rows, None] - frames >= _LEAST_GAP_FRAMES
-        return np.asarray(is_later & (track.path[frames][rows, None] - track.path[frames] >= least))
+        return is_later & (track.path[frames][rows, None] - track.path[frames] >= least)
 
     closures = find_loops(views, track, apart, LoopVerifier(OF_FRAMES, intrinsics, seed))
     return replace(

@@ -125,4 +125,4 @@ def _directions_deg(grey: Grey, pixels: NDArray[np.floating[Any]]) -> FloatArray
     places = np.add.outer(v * padded.shape[1] + u, y * padded.shape[1] + x)
     around = padded.ravel()[places].astype(np.float32)  # whole numbers, of which sums are exact
     down, right = (around @ np.column_stack([y, x]).astype(np.float32)).astype(np.float64).T
-    return np.asarray(np.rad2deg(np.arctan2(down, right)) % 360.0)
+    return np.rad2deg(np.arctan2(down, right)) % 360.0

@@ -229,7 +229,7 @@ class LoopVerifier:
         length_sigma = _LENGTH_RELATIVE_SIGMA * float(np.linalg.norm(T_a_b[:3, 3]))
         translation_floor = np.hypot(self.thresholds.translation_floor_ratio * depth, length_sigma)
         floors = np.repeat([np.deg2rad(self.thresholds.rotation_floor_deg), translation_floor], 3)
-        return np.asarray(np.linalg.norm([corners, disagreement, floors], axis=0))
+        return np.linalg.norm([corners, disagreement, floors], axis=0)
 
 
 def matches(

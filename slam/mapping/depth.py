@@ -160,7 +160,7 @@ class DepthFilters:
         """Pixels ``(H, W)`` whose depth is consistent with the other view's depth."""
         u, v, z = self.projected(view, other)
         there = sampled(self.trusted(other), u, v)
-        return np.asarray(np.abs(there - z) < np.float32(_MAX_DEPTH_DIFFERENCE) * z)
+        return np.abs(there - z) < np.float32(_MAX_DEPTH_DIFFERENCE) * z
 
     def _is_seen_through(self, view: KeyframeDepth, earlier: KeyframeDepth) -> Mask:
         """Pixels ``(H, W)`` of pieces behind which the earlier view sees something."""
@@ -173,9 +173,7 @@ class DepthFilters:
 
 def sampled(image: NDArray[Any], u: DepthMap, v: DepthMap) -> NDArray[Any]:
     """The pixels of an image nearest to columns and rows ``(H, W)``, 0 outside of it."""
-    return np.asarray(
-        cv2.remap(image, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-    )
+    return cv2.remap(image, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
 
 
 def _at_edges(depth: DepthMap, max_step: float) -> Mask:

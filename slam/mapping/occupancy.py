@@ -87,14 +87,12 @@ class Grid:
         """Flat numbers ``(P,)`` of the cells of points ``(P, 2 or 3)``."""
         places = np.floor(points[:, :2] / self.resolution - self.first)
         column, row = np.clip(places, 0, [self.width - 1, self.height - 1]).astype(np.int64).T
-        return np.asarray(row * self.width + column)
+        return row * self.width + column
 
     def centres(self, cells: NDArray[np.int64]) -> FloatArray:
         """Centres ``(C, 2)`` of cells by their flat numbers."""
         row, column = np.divmod(cells, self.width)
-        return np.asarray(
-            (self.first + 0.5 + np.stack([column, row], axis=1)) * self.resolution, np.float64
-        )
+        return (self.first + 0.5 + np.stack([column, row], axis=1)) * self.resolution
 
 
 def occupancy_grid(

@@ -189,7 +189,7 @@ class MergedSubmaps:
         total = np.zeros_like(weight)
 
         def cells(of_blocks: Keys) -> NDArray[np.intp]:
-            return np.asarray(np.ravel_multi_index(tuple((of_blocks - low).T), tuple(high - low)))
+            return np.ravel_multi_index(tuple((of_blocks - low).T), tuple(high - low))
 
         cells_of_all = cells(keys)
         for number, mask in enumerate(inside):

@@ -272,7 +272,7 @@ def extract_tile(
 def in_tile(points: FloatArray, tile: NDArray[np.int64], voxel_size_m: float) -> Mask:
     """Which points ``(P, 3)`` are in a tile."""
     side = voxel_size_m * BLOCK_SIDE * TILE_BLOCKS
-    return np.asarray((np.floor(points / side) == tile).all(axis=1))
+    return (np.floor(points / side) == tile).all(axis=1)
 
 
 def _extract(

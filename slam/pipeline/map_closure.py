@@ -149,7 +149,7 @@ class _Rows:
         of_row = np.repeat(np.arange(len(tracks)), [len(of_keyframe) for of_keyframe in tracks])
         shape = len(tracks), int(first[-1])
         seen = csr_array((np.ones(len(of_row)), (of_row, np.concatenate(tracks))), shape=shape)
-        return np.asarray((seen @ seen.T).toarray() < _CONNECTED)
+        return (seen @ seen.T).toarray() < _CONNECTED
 
     def joins(self, loops: Sequence[Loop]) -> tuple[TrackingEvent, ...]:
         """Each map after the first that loops join with an earlier one."""

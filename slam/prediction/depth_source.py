@@ -176,9 +176,7 @@ def at_size(disparity: Disparity, height: int, width: int) -> Disparity:
         return disparity
     known = np.isfinite(disparity)
     if known.all():
-        return np.asarray(
-            cv2.resize(disparity, (width, height), interpolation=cv2.INTER_LINEAR), np.float32
-        )
+        return cv2.resize(disparity, (width, height), interpolation=cv2.INTER_LINEAR)
     shrinks = disparity.shape[0] >= height and disparity.shape[1] >= width
     method, least = (cv2.INTER_AREA, 1e-3) if shrinks else (cv2.INTER_LINEAR, 0.5)
     weight, total = (
@@ -429,7 +427,7 @@ class OnnxDepth:
                 f"output {self._output} of {self._path} must be floats of one map (1, 1, H, W) of at most "
                 f"{MOST_PIXELS:,} pixels; got {found.dtype} {found.shape}: choose another with depth.output_name"
             )
-        return np.asarray(found.reshape(sides), dtype=np.float32)
+        return found.reshape(sides)
 
     def _opened(self, content: bytes) -> tuple[onnxruntime.InferenceSession, dict[str, str]]:
         """A graph whose weights are all in its file, ready to run, and its metadata."""

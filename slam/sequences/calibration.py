@@ -269,9 +269,7 @@ class Calibration:
     @property
     def tilts_deg(self) -> FloatArray:
         """Angle between the board and the image plane in each view ``(V,)``."""
-        return np.asarray(
-            np.rad2deg(np.arccos(np.clip(np.abs(self.T_camera_board[:, 2, 2]), 0, 1)))
-        )
+        return np.rad2deg(np.arccos(np.clip(np.abs(self.T_camera_board[:, 2, 2]), 0, 1)))
 
     @property
     def covered(self) -> float:

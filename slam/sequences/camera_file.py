@@ -394,10 +394,7 @@ class Undistortion:
                 f"the image is {width}x{height}, its camera {camera.width}x{camera.height}: "
                 "give the calibration of this camera at this size"
             )
-        return np.asarray(
-            cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
-            np.uint8,
-        )
+        return cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def apply_to_depth(self, depth: DepthMap) -> DepthMap:
         """Undistort z-depth ``(H, W)`` of an image, not positive or not finite where unknown."""
@@ -430,7 +427,7 @@ class Undistortion:
         (angle,) = self._coefficients
         radius = np.linalg.norm(rays, axis=1, keepdims=True)
         bent = np.arctan(2 * radius * np.tan(angle / 2)) / angle
-        return np.asarray(rays * bent / np.maximum(radius, 1e-12))
+        return rays * bent / np.maximum(radius, 1e-12)
 
     def _shortest_zoom(self, width: int, height: int) -> float:
         """Zoom out from the centre until the border of the pinhole image meets that of the lens's image."""
@@ -521,4 +518,4 @@ def fixed_to(camera: CameraFile, undistortion: Undistortion | None) -> Mask | No
             "its images"
         )
     image = image if undistortion is None else undistortion.apply(image)
-    return np.asarray(image[..., 0] < _BLACK)
+    return image[..., 0] < _BLACK

@@ -102,7 +102,7 @@ def _times_of_images(places: list[Path], files: NumberedFiles, fps: float) -> Fl
         stamps = np.array([float(f"{match[1]}.{match[2]}") for match in times if match is not None])
         if (np.diff(stamps) > 0).all():
             logger.info("%s: names are taken for the times of the images", files.paths[0].parent)
-            return np.asarray(stamps)
+            return stamps
     return uniform_stamps(len(files), fps)
 
 

@@ -328,7 +328,7 @@ def require_stamps(stamps: FloatArray, path: Path, files: NumberedFiles) -> Floa
     rows, skipped = assigned
     if len(rows) == len(files):
         return stamps[skipped:]
-    return np.asarray(np.interp(np.arange(len(files)), rows, stamps))
+    return np.interp(np.arange(len(files)), rows, stamps)
 
 
 def _mended_stamps(stamps: FloatArray, path: Path) -> FloatArray:
@@ -343,7 +343,7 @@ def _mended_stamps(stamps: FloatArray, path: Path) -> FloatArray:
     beyond, period = (len(stamps), float(np.median(np.diff(times) / np.diff(rows))))
     times = np.r_[times[0] - beyond * period, times, times[-1] + beyond * period]
     known = np.r_[rows[0] - beyond, rows, rows[-1] + beyond]
-    return np.asarray(np.interp(np.arange(1, len(stamps) + 1), known, times))
+    return np.interp(np.arange(1, len(stamps) + 1), known, times)
 
 
 def _require_short_gaps(files: NumberedFiles, stamps: FloatArray) -> None:

@@ -211,7 +211,7 @@ def transform_of(message: Any) -> FloatArray:
         else (message.translation, message.rotation)
     )
     (T,) = poses_of(np.array([[t.x, t.y, t.z]]), np.array([[q.x, q.y, q.z, q.w]]))
-    return np.asarray(T)
+    return T
 
 
 def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> RecordedSequence:

@@ -78,7 +78,7 @@ class Floor:
     def clearance(self, points: FloatArray) -> FloatArray:
         """Distance in plan from points ``(M, 2)`` to what stands there, metres, ``(M,)``."""
         row_column = ((points - self._origin) / CELL - 0.5).T[::-1]
-        return np.asarray(map_coordinates(self._clearance, row_column, order=1, mode="nearest"))
+        return map_coordinates(self._clearance, row_column, order=1, mode="nearest")
 
     def path(self, start: int, end: int) -> FloatArray:
         """A walk between two places, a point every ``CELL`` or so, ``(M, 2)``."""
@@ -92,15 +92,15 @@ class Floor:
             rounded = gaussian_filter1d(walk, corner_m / CELL, axis=0, mode="nearest")
             rounded[[0, -1]] = walk[[0, -1]]
             if self.clearance(rounded).min() >= _SMOOTH_CLEAR_M:
-                return np.asarray(rounded)
+                return rounded
         return walk
 
     def lengths(self, start: int) -> FloatArray:
         """How far every place is from one of them, ``(P,)``."""
-        return np.asarray(self._from(start)[0][self._at])
+        return self._from(start)[0][self._at]
 
     def _centres(self, cells: IntArray) -> FloatArray:
-        return np.asarray(self._origin + (cells + 0.5) * CELL)
+        return self._origin + (cells + 0.5) * CELL
 
     def _connect(self) -> coo_array:
         """Neighbouring cells, farther apart the nearer they are to walls."""
@@ -233,7 +233,7 @@ def _unrest(rng: np.random.Generator, count: int, seconds: float) -> FloatArray:
     noise = gaussian_filter1d(rng.standard_normal(count + 2 * margin), sigma)[
         margin : margin + count
     ]
-    return np.asarray(np.clip(noise * np.sqrt(3.54 * sigma), -2.5, 2.5))
+    return np.clip(noise * np.sqrt(3.54 * sigma), -2.5, 2.5)
 
 
 class _Walk:

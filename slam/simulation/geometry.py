@@ -146,7 +146,7 @@ def interpolated(at: FloatArray, known: NDArray[Any], rows: FloatArray) -> Float
 
 def unit(rows: FloatArray) -> FloatArray:
     """Directions of vectors ``(N, 3)`` or ``(N, 2)``; those of no length stay as they are."""
-    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9))
+    return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9)
 
 
 def luck(seed: int, *draw: int) -> np.random.Generator:

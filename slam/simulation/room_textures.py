@@ -40,7 +40,7 @@ def _boards(texels: Texels) -> Lengths:
     tone = 0.3 * near * (cell_hash(np.divide(along, 0.9, dtype=np.float32), row, 4) - 0.5)
     veins = texels.fractal((0.9, 0.06, 0.1), (0.25, 0.02, 0.12), (0.08, 0.008, 0.1))
     gaps = np.maximum(texels.v.stripes(width, 0.006), texels.u.on(along).stripes(0.9, 0.006))
-    return np.asarray(texels.first * (1.0 + tone + veins) * (1.0 - 0.55 * gaps))
+    return texels.first * (1.0 + tone + veins) * (1.0 - 0.55 * gaps)
 
 
 def _carpet(texels: Texels) -> Lengths:

@@ -120,7 +120,7 @@ class SimulatedRooms(SimulatedWorld):
     def _shade(self, hits: Hits, surfaces: list[Surface]) -> Float32Array:
         rgb = hits.unlit(self.camera.fx)
         if hits.surface is self._still:
-            return np.asarray(rgb * self._light(hits.triangle, hits.barycentric))
+            return rgb * self._light(hits.triangle, hits.barycentric)
         # people are as bright as what is below them
         down = hits.rays.copy()
         down[:, :3] += down[:, 3:] * hits.depth[:, None]
@@ -128,7 +128,7 @@ class SimulatedRooms(SimulatedWorld):
         below = self._still.cast(down)["primitive_ids"].astype(np.int64)
         below = np.minimum(below, self._irradiance.shape[1] - 1)
         light = self._irradiance[:, below].mean(axis=0)
-        return np.asarray(rgb * light * (0.85 + 0.15 * hits.normals[2]))
+        return rgb * light * (0.85 + 0.15 * hits.normals[2])
 
     def _light(self, triangle: NDArray[np.int64], barycentric: Float32Array) -> Float32Array:
         """Irradiance at points of triangles ``(N,)``; of what glows, its own light."""
@@ -139,7 +139,7 @@ class SimulatedRooms(SimulatedWorld):
             + barycentric[1] * (corners[2] - corners[0])
         )
         glow = _GLOW[np.take(self._still.mesh.material, triangle)]
-        return np.asarray(np.where(glow > 0.0, glow, light))
+        return np.where(glow > 0.0, glow, light)
 
     def _develop(self, rgb: Float32Array, index: int) -> Float32Array:
         """Gain, lens blur and noise."""

@@ -68,7 +68,7 @@ class Site:
     @property
     def origin(self) -> FloatArray:
         """Where it is, ``(3,)``."""
-        return np.asarray(self.frame[3])
+        return self.frame[3]
 
     def at(self, x: float, y: float, angle: float = 0.0, z: float = 0.0) -> "Site":
         """Another place in the plan, its x axis turned by ``angle`` radians from east."""
@@ -95,7 +95,7 @@ class Site:
         spread, colours = itemgetter("spread", "colours")(_palettes()[thing])
         base = np.array(colours[self.rng.integers(len(colours))])
         off = self.rng.normal(0.0, spread) + self.rng.normal(0.0, 0.4 * spread, 3)
-        return np.asarray(np.clip(base + off, 0.02, 1.0))
+        return np.clip(base + off, 0.02, 1.0)
 
     def instance(
         self,

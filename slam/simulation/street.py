@@ -150,7 +150,7 @@ class SimulatedStreet(SimulatedWorld):
         # poses while the shutter is open around a frame; all one pose at a stop
         low, high = max(index - 1, 0), min(index + 1, len(self) - 1)
         if "blur" not in self.options.hazards:
-            return np.asarray(here[None])
+            return here[None]
         T_low_high = se3.invert(T_street_camera[low]) @ T_street_camera[high]
         turn = Rotation.from_matrix(T_low_high[:3, :3]).as_rotvec()
         fraction = ((np.arange(BLUR_SAMPLES) + 0.5) / BLUR_SAMPLES - 0.5)[:, None]
@@ -176,7 +176,7 @@ class SimulatedStreet(SimulatedWorld):
         )
         fraction = np.clip(1.6 * cover, 0.0, 0.85)
         white = 0.88 + 0.08 * np.clip(cover, 0.0, 1.0)
-        return np.asarray(rgb + fraction * (white - rgb), dtype=np.float32)
+        return rgb + fraction * (white - rgb)
 
     def _shade(self, hits: Hits, surfaces: list[Surface]) -> Float32Array:
         weather, mesh = self._weather, hits.surface.mesh
@@ -206,7 +206,7 @@ class SimulatedStreet(SimulatedWorld):
         rgb *= np.asarray(direct * warm + around * cool, dtype=np.float32)  # irradiance
         distance = hits.depth * self._stretch[hits.pixels]
         haze = -np.expm1(-distance / np.float32(weather.visibility_m))
-        return np.asarray(rgb + haze * (weather.horizon[:, None] - rgb), dtype=np.float32)
+        return rgb + haze * (weather.horizon[:, None] - rgb)
 
     def _develop(self, rgb: Float32Array, index: int) -> Float32Array:
         """Rain, lens blur and exposure."""
@@ -237,7 +237,7 @@ def rained_on(rgb: Float32Array, seed: int, index: int) -> Float32Array:
         kernel[row, int(length / 2 + slant * (row - length / 2))] = 1.0
     streaks = np.clip(cv2.filter2D(drops, -1, kernel), 0.0, 1.0)[..., None] * 0.4
     veiled = rgb * 0.85 + 0.07
-    return np.asarray(veiled + streaks * (0.85 - veiled), dtype=np.float32)
+    return veiled + streaks * (0.85 - veiled)
 
 
 @dataclass(frozen=True)

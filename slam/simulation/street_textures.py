@@ -36,7 +36,7 @@ def _junction(texels: Texels) -> Lengths:
     line = np.abs(texels.fractal((2.6, 1.3, 1.0)) + 0.4 * grain - 0.05)
     crack = 0.3 * np.clip(1.0 - 14.0 * line, 0.0, 1.0)
     rough = 1.0 - texels.parameters[5, 0]
-    return np.asarray(texels.first * (1.0 + rough * grain - rough * patch - rough * crack))
+    return texels.first * (1.0 + rough * grain - rough * patch - rough * crack)
 
 
 def _pavement(texels: Texels) -> Lengths:
@@ -116,7 +116,7 @@ def _windows(rgb: Lengths, texels: Texels) -> Lengths:
 def _roof(texels: Texels) -> Lengths:
     rows, tiles = texels.v.stripes(0.35, 0.09), texels.u.stripes(0.3, 0.05)
     grain = texels.fractal((4.0, 3.0, 0.25), (0.9, 0.8, 0.22), (0.3, 0.35, 0.22))
-    return np.asarray(texels.first * (1.0 + grain - 0.3 * rows - 0.15 * tiles))
+    return texels.first * (1.0 + grain - 0.3 * rows - 0.15 * tiles)
 
 
 def _sign(texels: Texels) -> Lengths:

@@ -51,7 +51,7 @@ def cell_hash(u: Lengths, v: Lengths, salt: int) -> Lengths:
 
 def mix(a: Lengths | np.floating[Any], b: Lengths | np.floating[Any], fraction: Lengths) -> Lengths:
     """Blend colours ``(3, N)`` by a weight ``(N,)``."""
-    return np.asarray(a + fraction * (b - a), dtype=np.float32)
+    return a + fraction * (b - a)
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Axis:
 
         def integral(at: Lengths) -> Lengths:
             whole = np.floor(at / period)
-            return np.asarray(whole * width + np.minimum(at - whole * period, width))
+            return whole * width + np.minimum(at - whole * period, width)
 
         return (integral(x + half) - integral(x - half)) / (2.0 * half)
 

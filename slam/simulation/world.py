@@ -252,4 +252,4 @@ def square_camera(width: int, height: int, fov_deg: float) -> Intrinsics:
 
 def through_lens(rgb: Float32Array, blur_px: float = 0.55) -> Float32Array:
     """An image as blurred as a lens blurs it."""
-    return np.asarray(cv2.GaussianBlur(rgb, (3, 3), blur_px))
+    return cv2.GaussianBlur(rgb, (3, 3), blur_px)

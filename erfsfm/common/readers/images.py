@@ -163,7 +163,7 @@ def decode_image(data: bytes, where: str, stretch: Stretch | None = None) -> Ima
         picture = (stretch or Stretch.of([values])).apply(grey_or_colour)
         return np.ascontiguousarray(np.broadcast_to(picture[..., ::-1], (*values.shape[:2], 3)))
     colour = decode_values(data, where, cv2.IMREAD_COLOR)
-    return np.asarray(cv2.cvtColor(colour, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    return cv2.cvtColor(colour, cv2.COLOR_BGR2RGB)
 
 
 def read_values(path: Path) -> NDArray[Any]:
@@ -209,7 +209,7 @@ def decode_values(data: bytes, where: str, flags: int = cv2.IMREAD_UNCHANGED) ->
         raise DataError(f"{where} cannot be decoded: {error.err or error}") from error
     if image is None:
         raise DataError(f"{where} cannot be decoded: it is damaged or not an image; copy it again")
-    return np.asarray(image)
+    return image
 
 
 def stretch_of(places: Sequence[T], read: Callable[[T], NDArray[Any]]) -> Stretch | None:
@@ -270,7 +270,7 @@ def resize_image(image: Image, height: int, width: int) -> Image:
         return image
     shrinks = image.shape[0] >= height and image.shape[1] >= width
     method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(image, (width, height), interpolation=method))
+    return cv2.resize(image, (width, height), interpolation=method)
 
 
 def _file_bytes(path: Path) -> bytes:

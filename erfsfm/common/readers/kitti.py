@@ -344,4 +344,4 @@ def read_velodyne(path: Path, columns: int = VELODYNE_COLUMNS) -> NDArray[np.flo
         raise DataError(
             f"{path} has no point at a distance that a LiDAR measures; restore the scan or remove it"
         )
-    return np.asarray(points[measured])
+    return points[measured]

@@ -114,7 +114,7 @@ class VideoFrames:
         read, image = self._capture.retrieve()
         if not read:
             raise DataError(f"video {self._path} frame {index} cannot be decoded: copy it again")
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
     def _grab(self) -> bool:
         """Go to the next frame and note its time."""

@@ -326,7 +326,7 @@ class _Block:
 def _damped(blocks: FloatArray, damping: float) -> FloatArray:
     diagonal = np.einsum("kii->ki", blocks)
     added = damping * np.maximum(diagonal, 1e-6) + 1e-12
-    return np.asarray(blocks + added[:, :, None] * np.eye(blocks.shape[1]))
+    return blocks + added[:, :, None] * np.eye(blocks.shape[1])
 
 
 def solve_sum(parts: Sequence[Part], side: FloatArray) -> FloatArray | None:

@@ -158,10 +158,7 @@ class _Alignment:
 def _local_contrast(image: SmallImage, sigma: float) -> SmallImage:
     """Without its local mean and over its local contrast, so that neither light nor shadow is motion."""
     high = image - cv2.GaussianBlur(image, (0, 0), sigma)
-    return np.asarray(
-        high / np.sqrt(cv2.GaussianBlur(high * high, (0, 0), sigma) + _LEAST_CONTRAST**2),
-        np.float32,
-    )
+    return high / np.sqrt(cv2.GaussianBlur(high * high, (0, 0), sigma) + _LEAST_CONTRAST**2)
 
 
 def turned(pixels: Pixels | FloatArray, R_now_before: FloatArray, intrinsics: Intrinsics) -> Pixels:

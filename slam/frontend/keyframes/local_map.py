@@ -84,21 +84,21 @@ class Parallax:
     @property
     def settled(self) -> NDArray[np.bool_]:
         """Which points have parallax ``(N,)``."""
-        return np.asarray(self._cosine < np.cos(_SETTLED))
+        return self._cosine < np.cos(_SETTLED)
 
     def by_rays(self, pixel_angle: float) -> FloatArray:
         """Sigmas of the logarithm of depth ``(N,)`` by rays that are known to ``pixel_angle`` radians."""
         angle = np.arccos(np.clip(self._cosine, -1.0, 1.0))
-        return np.asarray(pixel_angle / np.maximum(angle, 1e-9))
+        return pixel_angle / np.maximum(angle, 1e-9)
 
     def prior_sigma(self, pixel_angle: float) -> FloatArray:
         """The same by learned depth ``(N,)``: errors that points share do not pull at what rays know."""
-        return np.asarray(DEPTH_SIGMA * (1.0 + (DEPTH_SIGMA / self.by_rays(pixel_angle)) ** 2))
+        return DEPTH_SIGMA * (1.0 + (DEPTH_SIGMA / self.by_rays(pixel_angle)) ** 2)
 
     def spread(self, pixel_angle: float) -> FloatArray:
         """One sigma of each point along its first ray ``(N, 3)``, if rays are known to ``pixel_angle`` radians."""
         sigma = np.minimum(self.by_rays(pixel_angle), DEPTH_SIGMA)
-        return np.asarray(sigma[:, None] * (self._points - self.centre))
+        return sigma[:, None] * (self._points - self.centre)
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ class LocalMap:
 
     def known(self, track_ids: TrackIds) -> NDArray[np.bool_]:
         """Which tracks have a point ``(M,)``."""
-        return np.asarray(np.isfinite(self.points[track_ids, 0]))
+        return np.isfinite(self.points[track_ids, 0])
 
     def new_tracks(self, count: int) -> TrackIds:
         """Identifiers of new tracks."""
@@ -306,7 +306,7 @@ class LocalMap:
     def ratios(self, keyframe: TrackedKeyframe) -> FloatArray:
         """Depth in the map over learned depth ``(M,)`` of a keyframe's corners, NaN where one is unknown."""
         depth = apply(keyframe.T_camera_world, self.points[keyframe.track_ids])[:, 2]
-        return np.asarray(depth / keyframe.learned_depth)
+        return depth / keyframe.learned_depth
 
     def aligned(self, image: NewImage, track_ids: TrackIds, pixels: Pixels) -> Pixels:
         """Corners of a new keyframe aligned to the earliest of the last keyframes that sees them, against drift."""
@@ -432,4 +432,4 @@ class NewImage:
 def _at(flow: NDArray[np.float32], pixels: Pixels) -> Pixels:
     """Flow ``(H, W, 2)`` at the nearest pixels ``(M, 2)``, inside."""
     x, y = np.rint(pixels).astype(np.intp).T
-    return np.asarray(flow[y, x])
+    return flow[y, x]

@@ -90,7 +90,7 @@ def _carries(sigmas: FloatArray) -> NDArray[np.bool_]:
     begun = np.flatnonzero(sigmas < _BEGUN)
     carries = sigmas < _CARRIED
     carries[: begun[0] if len(begun) else None] = True  # before points have parallax
-    return np.asarray(carries)
+    return carries
 
 
 def _cut(segment: LocalMap, carried: NDArray[np.bool_]) -> tuple[NDArray[np.intp], list[LocalMap]]:
@@ -142,7 +142,7 @@ def _add_frames(parts: Sequence[LocalMap], part_of: NDArray[np.intp], segment: L
 
 def _part_before(part_of: NDArray[np.intp]) -> NDArray[np.intp]:
     """The last part up to each keyframe ``(K,)``; the first one where there is none."""
-    return np.asarray(np.maximum.accumulate(part_of).clip(min=0))
+    return np.maximum.accumulate(part_of).clip(min=0)
 
 
 def _pace(keyframes: Sequence[TrackedKeyframe], tied: NDArray[np.bool_]) -> float:

@@ -52,13 +52,11 @@ class DepthError:
     def corrected(self, depth: DepthMap | FloatArray) -> FloatArray:
         """Learned depth of any shape without its bias; NaN stays."""
         logarithm = np.log(np.where(depth > 0, depth, np.nan))
-        return np.asarray(np.exp(logarithm - np.interp(logarithm, np.log(_DEPTHS), self.bias)))
+        return np.exp(logarithm - np.interp(logarithm, np.log(_DEPTHS), self.bias))
 
     def sigma(self, depth: FloatArray) -> FloatArray:
         """Relative sigma of learned depth of any shape, without its bias."""
-        return np.asarray(
-            np.interp(np.log(np.where(depth > 0, depth, 1.0)), np.log(_DEPTHS), self._spread)
-        )
+        return np.interp(np.log(np.where(depth > 0, depth, 1.0)), np.log(_DEPTHS), self._spread)
 
     def length(
         self, learned: FloatArray, triangulated: FloatArray, relative_sigma: FloatArray
@@ -135,7 +133,7 @@ class DepthError:
     def _spread(self) -> FloatArray:
         seen = 0.5 * (self._quantile(0.84) - self._quantile(0.16))
         noise = self.noise / (self.corners.sum(axis=1) + _PRIOR_CORNERS)
-        return np.asarray(np.sqrt(np.maximum(seen**2 - noise**2, _LEAST_SIGMA**2)))
+        return np.sqrt(np.maximum(seen**2 - noise**2, _LEAST_SIGMA**2))
 
     @property
     def total_spread(self) -> float | None:

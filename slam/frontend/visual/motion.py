@@ -54,7 +54,7 @@ class Motion:
     def corner_sigmas(self) -> FloatArray:
         """Sigmas ``(6,)`` of rotation and direction by the corners' own covariance, of a triangulated motion."""
         assert self.covariance is not None
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
+        return np.sqrt(np.diag(self.covariance))
 
     def with_length(
         self,

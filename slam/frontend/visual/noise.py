@@ -72,7 +72,7 @@ def rotation_jitter(rotations: FloatArray) -> FloatArray:
     third = third[np.isfinite(third).all(axis=1)]
     if len(third) < _LEAST_DIFFERENCES:
         return np.zeros(3)
-    return np.asarray(MAD_TO_SIGMA * np.median(np.abs(third), axis=0) / _THIRD_DIFFERENCE)
+    return MAD_TO_SIGMA * np.median(np.abs(third), axis=0) / _THIRD_DIFFERENCE
 
 
 def neighbour_residual(values: FloatArray) -> FloatArray:
@@ -94,4 +94,4 @@ def neighbour_residual(values: FloatArray) -> FloatArray:
 
 def _unexplained(seen: FloatArray, known: FloatArray) -> FloatArray:
     """The part of a deviation ``(D,)`` that known sigmas ``(D,)`` do not explain."""
-    return np.asarray(np.sqrt(np.maximum(seen**2 - known**2, 0.0)))
+    return np.sqrt(np.maximum(seen**2 - known**2, 0.0))

@@ -403,9 +403,7 @@ class DynamicMask:
             cv2.GaussianBlur(kind, (0, 0), _SPREAD_CELLS) for kind in (self.inliers, self.corners)
         )
         ratio = (inliers + _PRIOR_CORNERS * usual) / (corners + _PRIOR_CORNERS)
-        return np.asarray(
-            np.minimum(ratio[self._cells(pixels)] / max(usual, 1e-3), 1.0) ** _SHARPNESS
-        )
+        return np.minimum(ratio[self._cells(pixels)] / max(usual, 1e-3), 1.0) ** _SHARPNESS
 
     def updated(self, pixels: FloatArray, is_inlier: NDArray[np.bool_]) -> Self:
         """The mask after one more step, whose corners now lie at ``pixels`` ``(M, 2)``."""

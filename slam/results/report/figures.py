@@ -333,4 +333,4 @@ def _depths(points: FloatArray, T_world_camera: FloatArray) -> FloatArray:
     """Depths of the points ``(P, 3)`` that lie in the field of view."""
     X = apply(invert(T_world_camera), points)
     inside = (X[:, 2] > 0) & (abs(X[:, :2]) < _HALF_FIELD * X[:, 2:]).all(axis=1)
-    return np.asarray(X[inside, 2])
+    return X[inside, 2]

@@ -257,7 +257,8 @@ def test_points_project_to_their_pixels(
 def test_images_of_a_lens_are_undistorted(make_recorded: MakeRecorded, tmp_path: Path) -> None:
     folder = make_recorded()
     camera_file = tmp_path / "drive" / "camera.yaml"
-    camera_file.write_text(camera_file.read_text() + "model: opencv\ndistortion: [-0.3, 0, 0, 0]\n")
+    lens = "model: opencv\ndistortion: [-0.3, 0, 0, 0]\nfx_sigma: 0.1\n"
+    camera_file.write_text(camera_file.read_text() + lens)
     with pytest.raises(RunError, match="another camera"):
         export(folder, "nerfstudio", tmp_path / "scene")
     camera = open_sequence(tmp_path / "drive").intrinsics
@@ -265,7 +266,7 @@ def test_images_of_a_lens_are_undistorted(make_recorded: MakeRecorded, tmp_path:
     content = scene(export(folder, "nerfstudio", tmp_path / "scene"))
     assert content["fl_x"] == camera.fx and content["k1"] == 0
     written = read_camera_file(tmp_path / "scene" / "camera.yaml")  # for erfsfm train
-    assert written.fx == camera.fx and not written.is_distorted
+    assert (written.fx, written.fx_sigma) == (camera.fx, 0.1) and not written.is_distorted
 
 
 def test_frames_without_a_usable_image_are_left_out(

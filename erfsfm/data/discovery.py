@@ -61,18 +61,18 @@ def discover(root: Path, camera: Path | None = None) -> list[Recording]:
         raise DataError(f"no data set at {root}: the path does not exist")
     found = _recordings_at(root, camera)
     if not found and root.is_dir():
-        visible = (p for p in root.iterdir() if not p.name.startswith("."))
-        children = sorted(p for p in visible if p.is_dir() or p.suffix.lower() in VIDEO_SUFFIXES)
-        for child in children:
-            found += _recordings_at(child, camera)
+        for child in sorted(root.iterdir()):
+            is_source = child.is_dir() or child.suffix.lower() in VIDEO_SUFFIXES
+            if is_source and child.name[0] != ".":
+                found += _recordings_at(child, camera)
     if not found:
         entries = (
             ", ".join(sorted(p.name for p in root.iterdir())[:8]) if root.is_dir() else root.name
         )
         raise DataError(
             f"no recording in {root}: wanted a KITTI odometry root (sequences/NN/image_2), KITTI raw drives "
-            f"(2011_09_26/..._sync/image_02), images or a video with camera.yaml, or a prepared folder "
-            f"({INDEX_FILE}); found "
+            "(2011_09_26/..._sync/image_02), images or a video with camera.yaml (erfsfm-slam run finds it, erfsfm-slam "
+            f"export --what nerfstudio writes both), or a prepared folder ({INDEX_FILE}); found "
             f"{entries or 'an empty folder'}"
         )
     return found

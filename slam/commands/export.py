@@ -280,9 +280,10 @@ def _write_images(
         )
     # for erfsfm train, which takes images without distortion alone
     rate = 1.0 / float(np.median(np.diff(sequence.stamps)))
-    camera = CameraFile(**vars(Pinhole.of(sequence.intrinsics)), fps=rate)
+    seen = sequence.intrinsics
+    camera = CameraFile(**vars(Pinhole.of(seen)), fps=rate, fx_sigma=seen.focal_sigma)
     write_camera(output, camera, sequence.fixed)
-    return sequence.intrinsics, written
+    return seen, written
 
 
 def _image_name(frame: int) -> str:

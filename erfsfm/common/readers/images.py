@@ -102,8 +102,8 @@ def recording_folder(folder: Path) -> Path:
 
 
 def is_image(path: Path) -> bool:
-    """Whether a file is an image by its name, and not hidden."""
-    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+    """Whether a file is an image by its name, and neither hidden nor the mask of a camera."""
+    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith((".", "mask."))
 
 
 def natural_key(path: Path) -> list[tuple[Decimal, str]]:

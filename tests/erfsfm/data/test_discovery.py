@@ -18,7 +18,7 @@ from slam.simulation.options import SimulationOptions
 from slam.simulation.recording import write_kitti_root
 from slam.simulation.rooms import SimulatedRooms
 
-CAMERA = {"width": 48, "height": 32, "fx": 40.0, "fy": 41.0, "cx": 23.5, "cy": 15.5, "fps": 10}
+CAMERA = yaml.safe_load("{width: 48, height: 32, fx: 40, fy: 41, cx: 23.5, cy: 15.5, fps: 10}")
 
 
 def write_images(

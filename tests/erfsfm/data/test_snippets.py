@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-import yaml
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader
@@ -32,6 +31,7 @@ from slam.simulation.options import SimulationOptions
 from slam.simulation.recording import write_kitti_root
 from slam.simulation.street import SimulatedStreet
 
+CAMERA = "width: 48\nheight: 32\nfx: 40\nfy: 41\ncx: 23.5\ncy: 15.5\nfps: 10\n"
 FRAMES = 9
 SIZE = (64, 96)
 
@@ -52,16 +52,7 @@ def coded(tmp_path: Path) -> Path:
     for code, name in enumerate("ab"):
         folder = tmp_path / name
         folder.mkdir()
-        camera = {
-            "width": 48,
-            "height": 32,
-            "fx": 40.0,
-            "fy": 41.0,
-            "cx": 23.5,
-            "cy": 15.5,
-            "fps": 10,
-        }
-        (folder / "camera.yaml").write_text(yaml.safe_dump(camera))
+        (folder / "camera.yaml").write_text(CAMERA)
         for index in range(FRAMES):
             image = np.full((32, 48, 3), (0, 200 * code, 20 * index), np.uint8)
             cv2.imwrite(str(folder / f"{index}.png"), image)
@@ -168,10 +159,12 @@ def test_weather_changes_only_the_network_input(coded: Path) -> None:
 def test_what_a_mask_hides_comes_with_every_sample(coded: Path) -> None:
     mask = np.full((32, 48), 255, np.uint8)
     mask[24:] = 0
-    cv2.imwrite(str(coded / "mask.png"), mask)
+    cv2.imwrite(str(coded / "a" / "mask.png"), mask)
     with (coded / "a" / "camera.yaml").open("a") as file:
-        file.write("mask: ../mask.png\n")
-    draws = SnippetDraws(discover(coded), experiment(zoom=1.0), 20)
+        file.write("mask: mask.png\n")
+    recordings = discover(coded)
+    assert {len(each) for each in recordings} == {FRAMES}  # the mask is no frame
+    draws = SnippetDraws(recordings, experiment(zoom=1.0), 20)
     for sample in map(draws.draw, range(20)):
         is_masked = folder_of(sample) == "a"
         assert sample["fixed"].shape == (1, 32, 48)

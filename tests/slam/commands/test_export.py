@@ -44,7 +44,7 @@ def test_ply_is_written_as_it_is_or_rotated_into_a_new_folder(
 ) -> None:
     folder = make_run()
     source = folder.path / f"map_{what}.ply"
-    copied = export(folder, what, tmp_path / "new" / "a.ply", "y-down")
+    copied = export(folder, what, tmp_path / "new" / "a.ply")
     assert copied.read_bytes() == source.read_bytes()
     turned = export(folder, what, tmp_path / "new" / "b.ply", "z")
     np.testing.assert_allclose(
@@ -120,7 +120,7 @@ def test_a_part_the_run_lacks_is_named(
     keep_places(folder)
     (folder.path / missing).unlink()
     with pytest.raises(RunError, match=f"has no {missing}"):
-        export(folder, what, tmp_path / "out.ply", "y-down")
+        export(folder, what, tmp_path / "out.ply")
 
 
 def test_a_map_that_is_cut_short_is_not_exported(make_run: MakeRun, tmp_path: Path) -> None:
@@ -140,7 +140,7 @@ def test_an_estimate_that_lacks_rows_is_not_exported(make_run: MakeRun, tmp_path
     with pytest.raises(
         RunError, match=r"trajectory_optimised\.tum\.txt is damaged: it has 199 rows for 300 frames"
     ):
-        export(folder, "colmap", tmp_path / "out", "y-down")
+        export(folder, "colmap", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -257,7 +257,8 @@ def test_points_project_to_their_pixels(
 def test_images_of_a_lens_are_undistorted(make_recorded: MakeRecorded, tmp_path: Path) -> None:
     folder = make_recorded()
     camera_file = tmp_path / "drive" / "camera.yaml"
-    camera_file.write_text(camera_file.read_text() + "model: opencv\ndistortion: [-0.3, 0, 0, 0]\n")
+    lens = "model: opencv\ndistortion: [-0.3, 0, 0, 0]\nfx_sigma: 0.1\n"
+    camera_file.write_text(camera_file.read_text() + lens)
     with pytest.raises(RunError, match="another camera"):
         export(folder, "nerfstudio", tmp_path / "scene")
     camera = open_sequence(tmp_path / "drive").intrinsics
@@ -265,7 +266,7 @@ def test_images_of_a_lens_are_undistorted(make_recorded: MakeRecorded, tmp_path:
     content = scene(export(folder, "nerfstudio", tmp_path / "scene"))
     assert content["fl_x"] == camera.fx and content["k1"] == 0
     written = read_camera_file(tmp_path / "scene" / "camera.yaml")  # for erfsfm train
-    assert written.fx == camera.fx and not written.is_distorted
+    assert (written.fx, written.fx_sigma) == (camera.fx, 0.1) and not written.is_distorted
 
 
 def test_frames_without_a_usable_image_are_left_out(

@@ -100,7 +100,7 @@ class DepthFilters:
             self._inside | is_exact,
             ~self._is_sky(view.image) | is_exact,
             (depth >= config.depth_min_m) & (depth < farthest),
-            everything if view.relative_sigma is None else sigma <= MOST_RELATIVE_SIGMA,
+            ~(sigma > MOST_RELATIVE_SIGMA),  # where none is stated, too
             ~_at_edges(self.trusted(view), _MAX_DEPTH_STEP) | is_exact,
             np.any([self._agrees(view, other) for other in others], axis=0)
             if others
@@ -109,11 +109,8 @@ class DepthFilters:
         )
         left = everything
         for number, mask in enumerate(masks):
-            remaining = left & mask
-            self._taken[number] += (
-                np.count_nonzero(left) - np.count_nonzero(remaining)
-            ) / depth.size
-            left = remaining
+            self._taken[number] += np.count_nonzero(left & ~mask) / depth.size
+            left = left & mask
         self._frames += 1
         return np.where(left, depth, np.float32(0))
 
@@ -234,10 +231,7 @@ class DepthRefiner:
             nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
             depth = depth[tuple(nearest)]
         T_neighbour_target = invert(self._T_world_camera[chosen]) @ self._T_world_camera[n]
-        others = [self._appearance(k) for k in chosen]
-        measurement = measure(
-            self._appearance(n), depth, others, self._intrinsics.K, T_neighbour_target
-        )
-        refined = self._decide(measurement)
+        images = self._appearance(n), depth, list(map(self._appearance, chosen))
+        refined = self._decide(measure(*images, self._intrinsics.K, T_neighbour_target))
         refined.relative_sigma[unknown & ~refined.measured] = np.inf
         return refined

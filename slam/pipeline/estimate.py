@@ -88,11 +88,8 @@ def fuse(
     ``decide`` is between learned and measured depth, None where it is not refined; ``compare`` is called with each
     keyframe's depth.
     """
-    drive, scales, T_world_camera = (
-        estimate.drive,
-        estimate.scale.per_frame,
-        estimate.optimised.T_world_camera,
-    )
+    drive, scales = estimate.drive, estimate.scale.per_frame
+    T_world_camera = estimate.optimised.T_world_camera
     height, width = drive.keyframes[0].depth_unscaled.shape
     intrinsics = intrinsics.resized(width, height)
     guess_sigma = _ROOM_SIGMA if drive.by_keyframes and config.depth.is_learned else None
@@ -136,16 +133,14 @@ def keyframe_depths(
 ) -> Callable[[int], KeyframeDepth]:
     """The depth of the n-th keyframe of a drive in the unit of the trajectory, as a function of n.
 
-    The error of learned depth is taken out first. A camera that is carried turns on the spot, where nothing measures
-    learned depth: its error over distance is known by steps, which measure only the first frames there, and stays.
+    The error of learned depth is taken out first; where it is too near half of that, for what moves along with the
+    camera only seems to be far. A camera that is carried turns on the spot, where nothing measures learned depth: its
+    error over distance is known by steps, which measure only the first frames there, and stays.
     ``scale_per_frame`` ``(N,)`` and ``T_world_camera`` ``(N, 4, 4)`` are of all frames. ``guess_sigma`` is that of
     depth that was to be refined and has no neighbours, None for none.
     """
-    keyframes, refiner, error = (
-        drive.keyframes,
-        None,
-        DepthError() if drive.by_keyframes else drive.measured.depth_error,
-    )
+    keyframes, refiner = drive.keyframes, None
+    error = DepthError() if drive.by_keyframes else drive.measured.depth_error
     if decide is not None:
         indices = [keyframe.index for keyframe in keyframes]
         refiner = DepthRefiner(
@@ -155,14 +150,15 @@ def keyframe_depths(
     def depth_at(n: int) -> KeyframeDepth:
         keyframe = keyframes[n]
         scale, learned = float(scale_per_frame[keyframe.index]), keyframe.depth_unscaled
-        depth, sigma = (error.corrected(learned) * scale).astype(np.float32), None
+        depth, sigma = error.corrected(learned), None
+        depth = (np.minimum(depth, np.sqrt(depth * learned)) * scale).astype(np.float32)
         if refiner is not None and (refined := refiner.refine(n, depth)) is not None:
             depth, sigma = refined.depth, refined.relative_sigma
             # what is fixed to the camera, as its neighbours show it, too
             sigma[learned == 0] = np.inf
         elif refiner is not None and guess_sigma is not None:
             sigma = np.full_like(depth, guess_sigma)
-        pose, of_network = T_world_camera[keyframe.index], learned * np.float32(scale)
-        return KeyframeDepth(keyframe.index, depth, sigma, keyframe.image, pose, of_network)
+        pose, learned = T_world_camera[keyframe.index], learned * np.float32(scale)
+        return KeyframeDepth(keyframe.index, depth, sigma, keyframe.image, pose, learned)
 
     return depth_at

@@ -30,8 +30,7 @@ def refiner(distances: np.ndarray, read: list[int]) -> DepthRefiner:
 def test_neighbours_are_chosen_by_their_distance(step_m: float, expected: set[int]) -> None:
     read: list[int] = []
     offset = 20 if step_m < 1 else 0
-    n = 10 + offset
-    assert refiner(np.arange(80) * step_m, read).refine(n, DEPTH) is not None
+    assert refiner(np.arange(80) * step_m, read).refine(10 + offset, DEPTH) is not None
     assert {k - offset for k in read} == expected
 
 
@@ -44,7 +43,7 @@ def test_the_last_keyframe_has_its_neighbours_before_it() -> None:
 def test_what_is_unknown_begins_with_its_neighbours_and_is_not_believed_unmeasured() -> None:
     holes = DEPTH.copy()
     holes[10:20, 20:40] = 0
-    holes[0, 0], holes[0, 1] = np.nan, np.inf
+    holes[0, :2] = np.nan, np.inf
     refined = refiner(np.arange(20.0), []).refine(10, holes)
     assert refined is not None and np.isfinite(refined.depth).all() and (refined.depth > 0).all()
     unmeasured = ~(np.isfinite(holes) & (holes > 0)) & ~refined.measured

@@ -12,6 +12,7 @@ from erfsfm.mvs.refine import Decide, Measurement, RefinedDepth
 from slam.frames import Frame, Intrinsics
 from slam.frontend.drive import Drive
 from slam.frontend.measured import Keyframe, Measured
+from slam.frontend.visual.depth_error import DepthError
 from slam.mapping.depth import KeyframeDepth
 from slam.pipeline.estimate import keyframe_depths
 from slam.runtime.errors import Failed
@@ -44,7 +45,6 @@ def test_what_no_neighbour_measures_has_the_sigma_of_a_guess() -> None:
     standing = depths(0.0, guess_sigma=0.32)(2)
     assert standing.relative_sigma is not None
     np.testing.assert_allclose(standing.relative_sigma, 0.32)
-    np.testing.assert_allclose(standing.depth[:24], 5.0, rtol=1e-6)
     moving = depths(0.4, guess_sigma=0.32)(2)
     assert moving.relative_sigma is not None and moving.relative_sigma.min() != pytest.approx(0.32)
 
@@ -60,10 +60,13 @@ def test_what_is_fixed_to_the_camera_is_unknown_whatever_its_neighbours_say() ->
     np.testing.assert_allclose(sigma[:24], 0.1)
 
 
-@pytest.mark.parametrize(("guess_sigma", "decide"), [(None, sure), (0.32, None)])
-def test_depth_that_is_not_to_be_measured_has_no_sigma(
-    guess_sigma: float | None, decide: Decide | None
-) -> None:
+@pytest.mark.parametrize(
+    ("guess_sigma", "decide", "farther", "kept"), [(None, sure, 4.0, 2.0), (0.32, None, 0.5, 0.5)]
+)
+def test_depth_that_is_not_measured_has_no_sigma_and_half_of_what_makes_it_farther(
+    monkeypatch, guess_sigma, decide, farther, kept
+):
+    monkeypatch.setattr(DepthError, "corrected", lambda _, depth: farther * depth)
     standing = depths(0.0, guess_sigma, decide)(2)
     assert standing.relative_sigma is None
-    np.testing.assert_allclose(standing.depth[:24], 5.0, rtol=1e-6)
+    np.testing.assert_allclose(standing.depth[:24], 5.0 * kept, rtol=1e-6)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from slam.geometry.robust import median
 from slam.runtime.errors import Failed
 from slam.runtime.record import Count, Record
 
@@ -94,7 +95,7 @@ class DepthErrors:
             }
         return DepthMetrics.of(
             abs_rel=float(relative.mean()),
-            median_rel=float(np.median(relative)),
+            median_rel=median(relative),
             rmse_m=float(np.sqrt(np.square(depth - truth).mean())),
             a1=float((ratio < 1.25).mean()),
             by_range=by_range,

@@ -19,7 +19,7 @@ from slam.frontend.measured import named
 from slam.frontend.self_calibration import SURE, FoundCamera, check_camera
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.motion import Motion
-from slam.geometry.robust import mad_sigma
+from slam.geometry.robust import mad_sigma, median
 from slam.geometry.se3 import FloatArray, invert, path_distance, rotation_angle
 from slam.runtime.errors import Failed, SlamError
 
@@ -137,8 +137,8 @@ def of_steps(
     apart = np.arccos(np.clip(along, -1, 1))
     of_direction = np.hypot(_DIRECTION_RAD, np.arctan2(noise[:, 3:].max(axis=1), length_source))
     sigmas = max(
-        float(np.median(turned / np.hypot(_ROTATION_RAD, np.linalg.norm(noise[:, :3], axis=1)))),
-        float(np.median(apart / of_direction)),
+        median(turned / np.hypot(_ROTATION_RAD, np.linalg.norm(noise[:, :3], axis=1))),
+        median(apart / of_direction),
     )
     degrees = np.rad2deg([np.median(turned), np.median(apart)])
     return Agreement(
@@ -160,11 +160,11 @@ def of_positions(
         path_m: length of the path, of which an alignment keeps a small part as drift.
     """
     noise = np.hypot(sigmas, _DRIFT * path_m)
-    median = float(np.median(distances))
+    usual = median(distances)
     return Agreement(
         source,
         mad_sigma(distances / noise),
-        f"its positions lie {median:.1f} m off the path, median",
+        f"its positions lie {usual:.1f} m off the path, median",
     )
 
 
@@ -313,4 +313,4 @@ def share_right(sigmas: FloatArray | float, constants: tuple[float, float, float
         constants: the best share, the sigmas that halve it, and how steeply it falls.
     """
     best, half, steepness = constants
-    return np.asarray(best / (1.0 + (np.maximum(sigmas, 0.0) / half) ** steepness))
+    return best / (1.0 + (np.maximum(sigmas, 0.0) / half) ** steepness)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Intrinsics
 from slam.frontend.visual.depth_error import DepthError
-from slam.geometry.se3 import FloatArray
+from slam.geometry.se3 import FloatArray, length_of
 from slam.runtime.errors import Failed
 
 _POINTS = 1500  # approximate number of pixels
@@ -75,7 +75,7 @@ class GroundPlaneFitter:
         if scaled_normal is None:
             return Failed(f"no plane within {_MAX_TILT_DEG:g} deg of level in front of the car")
         scaled_normal = _reweighted(rays, inverse_depth, scaled_normal)
-        height = 1.0 / float(np.linalg.norm(scaled_normal))
+        height = 1.0 / length_of(scaled_normal)
         inlier_ratio = float(_inliers(rays, inverse_depth, scaled_normal[None])[0].mean())
         if scaled_normal[1] * height < np.cos(np.deg2rad(_MAX_TILT_DEG)):
             return Failed(

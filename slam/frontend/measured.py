@@ -81,7 +81,7 @@ class Keyframe:
         camera = intrinsics.resized(*depth.shape[::-1])
         v, u = np.mgrid[: camera.height : stride, : camera.width : stride].reshape(2, -1)
         points = camera.rays(np.column_stack([u, v])) * depth[v, u, None]
-        return np.asarray(points[points[:, 2] > 0])
+        return points[points[:, 2] > 0]
 
 
 @dataclass

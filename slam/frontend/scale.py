@@ -32,7 +32,7 @@ from slam.frontend.drive import Drive
 from slam.frontend.road import RoadStep
 from slam.frontend.visual.motion import Motion, links
 from slam.geometry.robust import difference_equations, mad_sigma, median, running_median
-from slam.geometry.se3 import FloatArray
+from slam.geometry.se3 import FloatArray, length_of
 from slam.runtime.errors import Failed
 
 LengthUnit = Literal["metres", "camera heights", "no metric unit", "the networks' own unit"]
@@ -153,7 +153,7 @@ class Scale:
             logger.warning("no scale (%s): lengths stay in %s", other.reason, self.unit)
             return replace(self, estimate=other)
         per_frame = other.value * self.per_frame
-        estimate = replace(other, value=float(np.median(per_frame)))
+        estimate = replace(other, value=median(per_frame))
         lengths = {
             ends: length._replace(value=other.value * length.value)
             for ends, length in self.lengths.items()
@@ -186,7 +186,7 @@ def find_scale(unit: Unit, drive: Drive, lidar_steps: Sequence[RelativePose] = (
     if isinstance(by_planes, Failed):
         both = motions.keys() & absolute.keys()
         ratios = [absolute[ends][0] / motions[ends].length_unscaled for ends in both]
-        prior_unit = float(np.median(ratios)) if ratios else 1.0
+        prior_unit = median(ratios) if ratios else 1.0
     else:
         prior_unit = by_planes.value
     evidence = gather_evidence(steps, drive.steps, absolute, prior_unit)
@@ -212,7 +212,7 @@ def find_scale(unit: Unit, drive: Drive, lidar_steps: Sequence[RelativePose] = (
     named: LengthUnit = "metres" if is_metric else "camera heights"
     if used >= MIN_FRAMES:
         spread = mad_sigma(misfit[np.isfinite(misfit)])
-        estimate = ScaleEstimate(float(np.median(per_frame)), spread, used)
+        estimate = ScaleEstimate(median(per_frame), spread, used)
     elif isinstance(by_planes, Failed):
         named = "the networks' own unit"
         logger.warning("no scale (%s): lengths stay in %s", by_planes.reason, named)
@@ -235,7 +235,7 @@ def _absolute_lengths(
         ends: (unit * road.length_heights, road.relative_sigma) for ends, road in road_steps.items()
     }
     for pose in lidar_steps:
-        length = float(np.linalg.norm(pose.T_from_to[:3, 3]))
+        length = length_of(pose.T_from_to[:3, 3])
         if length > 0:
             absolute[pose.ends] = length, float(pose.sigmas[3]) / length
     return absolute
@@ -243,7 +243,7 @@ def _absolute_lengths(
 
 def height_by_lidar(lidar_steps: Sequence[RelativePose], drive: Drive) -> float | None:
     """The camera's height from steps measured by LiDAR and the road, or else by learned planes; None without both."""
-    metres = {pose.ends: float(np.linalg.norm(pose.T_from_to[:3, 3])) for pose in lidar_steps}
+    metres = {pose.ends: length_of(pose.T_from_to[:3, 3]) for pose in lidar_steps}
     roads = drive.road_steps
     heights = [metres[ends] / roads[ends].length_heights for ends in roads if ends in metres]
     if not heights:
@@ -253,7 +253,7 @@ def height_by_lidar(lidar_steps: Sequence[RelativePose], drive: Drive) -> float 
             plane = drive.measured.roads[ends[0]]
             if not isinstance(plane, Failed):
                 heights.append(metres[ends] / motion.length_unscaled * plane)
-    return float(np.median(heights)) if heights else None
+    return median(heights) if heights else None
 
 
 def scale_from_road(roads: Sequence[float | Failed], height: float = 1.0) -> ScaleEstimate | Failed:

@@ -17,7 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry.robust import mad_sigma, median
-from slam.geometry.se3 import FloatArray, apply, compose, make, nearest_rotation, rotation_matrix
+from slam.geometry.se3 import (
+    FloatArray,
+    apply,
+    compose,
+    length_of,
+    make,
+    nearest_rotation,
+    rotation_matrix,
+)
 
 LEAST_DEPTH = 1e-6
 MIN_POINTS = 20  # least number of points that give a camera its pose
@@ -249,7 +257,7 @@ class UnitRelativePose:
     @classmethod
     def of(cls, T_current_previous: FloatArray) -> tuple[Self, float] | None:
         """That of a transform, and its length; None where it has none."""
-        length = float(np.linalg.norm(T_current_previous[:3, 3]))
+        length = length_of(T_current_previous[:3, 3])
         return (
             (cls(T_current_previous[:3, :3], T_current_previous[:3, 3] / length), length)
             if length > 0

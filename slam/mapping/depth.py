@@ -19,6 +19,7 @@ from erfsfm.mvs.refine import Decide, RefinedDepth, measure
 from erfsfm.mvs.views import Appearance, neighbours_around
 from slam.config.sections import MappingConfig
 from slam.frames import DepthMap, Image, Intrinsics, Mask
+from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray, invert
 
 # chosen on simulated streets and on drive 0013, see docs/design/map.md
@@ -160,7 +161,7 @@ class DepthFilters:
         """Pixels ``(H, W)`` whose depth is consistent with the other view's depth."""
         u, v, z = self.projected(view, other)
         there = sampled(self.trusted(other), u, v)
-        return np.asarray(np.abs(there - z) < np.float32(_MAX_DEPTH_DIFFERENCE) * z)
+        return np.abs(there - z) < np.float32(_MAX_DEPTH_DIFFERENCE) * z
 
     def _is_seen_through(self, view: KeyframeDepth, earlier: KeyframeDepth) -> Mask:
         """Pixels ``(H, W)`` of pieces behind which the earlier view sees something."""
@@ -227,9 +228,7 @@ class DepthRefiner:
         unknown = ~(np.isfinite(depth) & (depth > 0))
         if unknown.all():
             return None
-        chosen = neighbours_around(
-            self._T_world_camera, n, float(np.median(depth[~unknown])), self._indices
-        )
+        chosen = neighbours_around(self._T_world_camera, n, median(depth[~unknown]), self._indices)
         if not chosen:
             return None
         if unknown.any():

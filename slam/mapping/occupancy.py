@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from slam.formats.ply import Ply
+from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray
 from slam.mapping.submap import moved_rows
 from slam.runtime.errors import RunError
@@ -189,12 +190,12 @@ def ground_along(
 
     limits = _NEAREST * camera_height, _FURTHEST * camera_height
     found = (depth[(depth > limits[0]) & (depth < limits[1])] for _, depth in around())
-    medians = [float(np.median(depth)) for depth in found if len(depth) >= _MIN_POINTS]
+    medians = [median(depth) for depth in found if len(depth) >= _MIN_POINTS]
     if not medians:
         raise RunError(
             "the map has no ground below the cameras, so free and occupied cannot be told apart"
         )
-    height = float(np.median(medians))
+    height = median(medians)
     planes = [
         _plane(
             near[np.abs(depth - height) < _BAND * height],

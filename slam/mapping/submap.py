@@ -18,7 +18,8 @@ from scipy.linalg import solveh_banded
 from scipy.spatial import cKDTree
 
 from slam.frames import DepthMap, Image, Intrinsics
-from slam.geometry.se3 import FloatArray, apply, invert, rotation_angle
+from slam.geometry.robust import median
+from slam.geometry.se3 import FloatArray, apply, invert, length_of, rotation_angle
 from slam.mapping.depth import DepthFilters, KeyframeDepth, sampled
 from slam.runtime.imports import import_open3d
 from slam.runtime.memory import SpilledArray
@@ -120,9 +121,7 @@ class Fusion:
         how = (self._K, T_camera_world, 1.0, self._reach, TRUNCATION_VOXELS)
         self._grid.integrate(self._grid.compute_unique_block_coordinates(image, *how), image, *how)
         position = T_world_camera[:3, 3]
-        self.length += (
-            0.0 if self._position is None else float(np.linalg.norm(position - self._position))
-        )
+        self.length += 0.0 if self._position is None else length_of(position - self._position)
         self._position = position
         return True
 
@@ -300,7 +299,7 @@ def has_moved(
     """
     T_before_camera = invert(T_world_before) @ T_world_camera
     turned = float(rotation_angle(T_before_camera[:3, :3]))
-    return float(np.linalg.norm(T_before_camera[:3, 3])) >= step_m or turned >= np.deg2rad(turn_deg)
+    return length_of(T_before_camera[:3, 3]) >= step_m or turned >= np.deg2rad(turn_deg)
 
 
 def moved_rows(T_world_camera: FloatArray, step_m: float, turn_deg: float) -> list[int]:
@@ -331,7 +330,7 @@ class Painter:
         self._submaps, self._voxel, self._range = submaps, voxel_size_m, reach_m
         steps, outwards, slopes = submaps.brightness_steps.T
         known = slopes[np.isfinite(slopes)]
-        self._darkening = float(np.median(known)) if len(known) else 0.0
+        self._darkening = median(known) if len(known) else 0.0
         self._gains = np.exp(-evened(steps - self._darkening * outwards))
 
     def colours(self, points_world: FloatArray) -> NDArray[np.uint8]:

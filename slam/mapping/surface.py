@@ -23,7 +23,7 @@ from erfsfm.common.progress import Progress, silent
 from slam.config.sections import MappingConfig
 from slam.formats.ply import Ply, write_ply_pieces
 from slam.frames import Mask
-from slam.geometry.se3 import FloatArray
+from slam.geometry.se3 import FloatArray, length_of
 from slam.mapping.submap import (
     BLOCK_SIDE,
     TILE_BLOCKS,
@@ -369,7 +369,7 @@ def _is_small_and_flat(corners: FloatArray, up_world: FloatArray, largest_m: flo
         return False
     (x, y, z), (u, v, w) = corners.T, corners[[*range(1, len(corners)), 0]].T
     area = 0.5 * np.array([y @ w - z @ v, z @ u - x @ w, x @ v - y @ u])
-    size = float(np.linalg.norm(area))
+    size = length_of(area)
     if size == 0 or float(-area @ up_world) < _UPWARDS * size:
         return False
     return float(np.abs(corners @ area).max()) <= _FLAT * largest_m * size

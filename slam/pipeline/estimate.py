@@ -23,6 +23,7 @@ from slam.frontend.gps import Location
 from slam.frontend.lidar_odometry import LidarPath
 from slam.frontend.scale import Scale
 from slam.frontend.visual.depth_error import DepthError
+from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures
@@ -123,7 +124,7 @@ def fitted(mapping: MappingConfig, drive: Drive, scale_per_frame: FloatArray) ->
         known = depth[np.isfinite(depth)]
         if known.size:
             medians.append(np.median(known))
-    return mapping.in_unit(float(np.median(medians)) / _STREET_DEPTH_M) if medians else mapping
+    return mapping.in_unit(median(medians) / _STREET_DEPTH_M) if medians else mapping
 
 
 def keyframe_depths(

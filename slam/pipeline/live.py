@@ -351,7 +351,7 @@ class Slam:
             pairs = zip(places.T_world_camera, places.views, strict=True)
             of_views = [apply(T, view.points.astype(np.float64)) for T, view in pairs]
         points = np.concatenate(of_views)
-        return np.asarray(points[np.isfinite(points).all(axis=1)])
+        return points[np.isfinite(points).all(axis=1)]
 
     def marginals(self, frame: int) -> FloatArray:
         """Covariance ``(6, 6)`` of a frame's pose, as `PoseGraph.marginal`.

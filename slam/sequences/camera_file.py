@@ -521,4 +521,4 @@ def fixed_to(camera: CameraFile, undistortion: Undistortion | None) -> Mask | No
             "its images"
         )
     image = image if undistortion is None else undistortion.apply(image)
-    return np.asarray(image[..., 0] < _BLACK)
+    return image[..., 0] < _BLACK

@@ -53,8 +53,8 @@ from slam.geometry.multiview import (
     triangulated_depth,
     triangulated_nearness,
 )
-from slam.geometry.robust import MAD_TO_SIGMA, mad_sigma, weighted_median
-from slam.geometry.se3 import FloatArray, apply, invert, make
+from slam.geometry.robust import MAD_TO_SIGMA, mad_sigma, median, weighted_median
+from slam.geometry.se3 import FloatArray, apply, invert, length_of, make
 from slam.runtime.errors import Failed
 
 logger = logging.getLogger(__name__)
@@ -256,7 +256,7 @@ class VisualOdometry:
         if near.sum() >= MIN_INLIERS:
             is_shared = (votes & near).sum() >= max(MIN_INLIERS, _LEAST_SHARED * near.sum())
             votes = votes & near if is_shared else near
-        flow = float(np.median(flows[votes]))
+        flow = median(flows[votes])
         has_stopped = self._history.is_possible_speed(0.0, seconds) is not False
         if flow >= _STILL_FLOW_PX or not (has_stopped and np.isfinite(depth).any()):
             return None
@@ -430,7 +430,7 @@ class VisualOdometry:
         if support < _LEAST_SUPPORT:
             return Failed(f"little parallax, and only {fits.sum()} of {tracks.sought} corners fit")
         self._fitted = tracks.track_ids[known][fits]
-        length = float(np.linalg.norm(resection.T_camera_world[:3, 3]))
+        length = length_of(resection.T_camera_world[:3, 3])
         # errors of corners are correlated, and so are those of learned depth
         floors = np.repeat([_LEAST_ROTATION_SIGMA, _LEARNED_RELATIVE_SIGMA * length], 3)
         sigmas = np.hypot(CORNER_CORRELATION * resection.sigmas, floors)
@@ -528,7 +528,7 @@ def most_credible(
         if height_unscaled is not None and road.sum() >= _LEAST_ROAD_CORNERS:
             rays = matches.rays_previous[road]
             depth = triangulated_depth(rays, matches.rays_current[road], step.two_view.unit_pose)
-            height = float(np.median(depth * rays[:, 1])) * step.motion.length_unscaled
+            height = median(depth * rays[:, 1]) * step.motion.length_unscaled
             votes.append(bool(abs(np.log(max(height, 1e-9) / height_unscaled)) < _AGREEMENT))
         # the direction is about the median of the last hundred steps, which a few wrong ones do not
         # change

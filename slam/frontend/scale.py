@@ -31,7 +31,7 @@ from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.road import RoadStep
 from slam.frontend.visual.motion import Motion, links
-from slam.geometry.robust import difference_equations, mad_sigma, median, running_median
+from slam.geometry.robust import difference_equations, mad_sigma, median, rms, running_median
 from slam.geometry.se3 import FloatArray, length_of
 from slam.runtime.errors import Failed
 
@@ -309,7 +309,7 @@ class StepEvidence:
         over_steps = (summed[_NOISE_STEPS:] - summed[:-_NOISE_STEPS])[whole]
         if len(over_steps) < _NOISE_STEPS:
             return 1.0
-        return max(float(np.sqrt(np.mean(over_steps**2))) / _USUAL_NOISE, 1.0)
+        return max(rms(over_steps) / _USUAL_NOISE, 1.0)
 
     def steady_sigma(self, log_length: FloatArray, camera_height: float) -> FloatArray:
         """By how much a vehicle's acceleration changes the logarithm of its speed from step to step ``(S - 1,)``.

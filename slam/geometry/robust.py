@@ -23,6 +23,11 @@ def median(values: ArrayLike) -> float:
     return float(0.5 * (ordered[below] + ordered[above]))
 
 
+def rms(errors: FloatArray) -> float:
+    """Root mean square of errors of any shape."""
+    return float(np.sqrt(np.mean(errors**2)))
+
+
 def mad_sigma(residuals: NDArray[np.floating[Any]]) -> float:
     """Sigma of residuals about zero, any shape, by their median absolute value; NaN where there are none."""
     return MAD_TO_SIGMA * median(np.abs(residuals))

@@ -24,7 +24,7 @@ from slam.frontend.drive import DOUBLED
 from slam.frontend.gps import GpsFixes, Location
 from slam.frontend.lidar_odometry import LidarPath
 from slam.frontend.visual.odometry import STILL_SOURCE
-from slam.geometry.robust import median
+from slam.geometry.robust import median, rms
 from slam.geometry.se3 import FloatArray, path_distance, umeyama
 from slam.graph.pose_graph import whitened_squared
 from slam.loops.closure import MOST_REJECTED, LoopClosures
@@ -323,9 +323,7 @@ def _distances(
     apart = fixes.offsets(T_enu_world @ trajectory.T_world_camera)
     level = np.linalg.norm(apart[:, :2], axis=1)
     return records.GpsErrors.of(
-        horizontal_rmse_m=float(np.sqrt((level**2).mean())),
+        horizontal_rmse_m=rms(level),
         horizontal_median_m=median(level),
-        vertical_rmse_m=float(np.sqrt((apart[:, 2] ** 2).mean()))
-        if fixes.has_heights
-        else _NO_HEIGHTS,
+        vertical_rmse_m=rms(apart[:, 2]) if fixes.has_heights else _NO_HEIGHTS,
     )

@@ -25,6 +25,7 @@ from slam.frames import Mask
 from slam.geometry.robust import median
 from slam.geometry.se3 import (
     FloatArray,
+    IntArray,
     Similarity,
     apply,
     length_of,
@@ -377,7 +378,7 @@ def _to_map(samples: FloatArray, points: FloatArray) -> FloatArray:
     return np.asarray(cKDTree(near).query(samples, distance_upper_bound=OUTLIER_M)[0])
 
 
-def double_wall_share(pieces: Iterable[tuple[FloatArray, NDArray[np.int64]]]) -> float:
+def double_wall_share(pieces: Iterable[tuple[FloatArray, IntArray]]) -> float:
     """Share of the area with a parallel surface 0.3 to 2 m before it; NaN without any area.
 
     Args:

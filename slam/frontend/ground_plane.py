@@ -8,11 +8,10 @@ a fit to points.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Intrinsics
 from slam.frontend.visual.depth_error import DepthError
-from slam.geometry.se3 import FloatArray, length_of
+from slam.geometry.se3 import BoolArray, FloatArray, length_of
 from slam.runtime.errors import Failed
 
 _POINTS = 1500  # approximate number of pixels
@@ -107,7 +106,7 @@ def _ransac(rays: FloatArray, inverse_depth: FloatArray, seed: int) -> FloatArra
     return best
 
 
-def _inliers(rays: FloatArray, inverse_depth: FloatArray, planes: FloatArray) -> NDArray[np.bool_]:
+def _inliers(rays: FloatArray, inverse_depth: FloatArray, planes: FloatArray) -> BoolArray:
     """Inliers ``(S, P)`` of planes ``n / h`` ``(S, 3)`` by the relative error of depth."""
     over_measured = (rays / inverse_depth[:, None]).T.astype(np.float32)
     relative = planes.astype(np.float32) @ over_measured

@@ -24,7 +24,15 @@ from numpy.typing import NDArray
 from slam.frames import Ends, Frame, Intrinsics, Mask, resized_mask, slopes_of
 from slam.frontend.visual.motion import Steps, links, triangulated
 from slam.geometry.robust import mad_sigma, median, running_median
-from slam.geometry.se3 import FloatArray, chain, interpolated, invert, length_of, path_distance
+from slam.geometry.se3 import (
+    FloatArray,
+    IntArray,
+    chain,
+    interpolated,
+    invert,
+    length_of,
+    path_distance,
+)
 from slam.runtime.errors import Failed
 
 _LEVEL = np.array([0.0, 1.0, 0.0])
@@ -300,10 +308,10 @@ class _Strip:
 
     relative_sigma: float
     hidden: float
-    rows: NDArray[np.int64]
-    columns: NDArray[np.int64]
+    rows: IntArray
+    columns: IntArray
     rays: _Layer
-    places: tuple[NDArray[np.int64], NDArray[np.int64]]
+    places: tuple[IntArray, IntArray]
     coverage: NDArray[np.float32]
     gradual: float
 

@@ -23,7 +23,6 @@ from itertools import compress
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
 from slam.config.sections import ScaleMode
@@ -32,7 +31,7 @@ from slam.frontend.drive import Drive
 from slam.frontend.road import RoadStep
 from slam.frontend.visual.motion import Motion, links
 from slam.geometry.robust import difference_equations, mad_sigma, median, rms, running_median
-from slam.geometry.se3 import FloatArray, length_of
+from slam.geometry.se3 import BoolArray, FloatArray, length_of
 from slam.runtime.errors import Failed
 
 LengthUnit = Literal["metres", "camera heights", "no metric unit", "the networks' own unit"]
@@ -327,7 +326,7 @@ class StepEvidence:
 
     def contradicted(
         self, log_length: FloatArray, log_unit: FloatArray, speed_sigma: FloatArray
-    ) -> NDArray[np.bool_]:
+    ) -> BoolArray:
         """Which lengths are not what learned depth says, or change as no vehicle's does ``(S,)``.
 
         Args:
@@ -364,7 +363,7 @@ class StepLengths:
     relative_sigma: FloatArray
     relative_correlated_sigma: FloatArray
     unit_correction: FloatArray
-    contradicted: NDArray[np.bool_]
+    contradicted: BoolArray
 
 
 def gather_evidence(

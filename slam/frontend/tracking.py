@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Frame, Grey, Intrinsics, resized_mask
 from slam.geometry.multiview import UnitRelativePose
-from slam.geometry.se3 import FloatArray, invert
+from slam.geometry.se3 import BoolArray, FloatArray, IntArray, invert
 
 Pixels = NDArray[np.float32]
 _TERMINATION = cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT
@@ -89,7 +89,7 @@ KEYFRAME_CORNERS = Texture(quality=0.0003, spacing_px=12.0, block_px=3)
 
 def track(
     first: Grey, second: Grey, pixels: Pixels, search: Search, guesses: Pixels | None = None
-) -> tuple[Pixels, NDArray[np.bool_]]:
+) -> tuple[Pixels, BoolArray]:
     """Pixels ``(M, 2)`` of the first image found in the second, and which of them were found back ``(M,)``.
 
     Args:
@@ -111,7 +111,7 @@ def track(
 
 def _lucas_kanade(
     first: Grey, second: Grey, pixels: Pixels, guesses: Pixels, search: Search
-) -> tuple[Pixels, NDArray[np.bool_]]:
+) -> tuple[Pixels, BoolArray]:
     if not len(pixels):
         return pixels, np.zeros(0, np.bool_)
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
@@ -128,7 +128,7 @@ def _lucas_kanade(
     return moved.reshape(-1, 2), status.ravel().astype(bool)
 
 
-def are_inside(pixels: Pixels, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def are_inside(pixels: Pixels, shape: tuple[int, ...]) -> BoolArray:
     """Which pixels ``(M, 2)`` lie in an image ``(H, W)``."""
     return np.asarray(
         (pixels >= 0).all(axis=1) & (pixels <= [shape[1] - 1, shape[0] - 1]).all(axis=1)
@@ -201,13 +201,11 @@ class Tracks:
 
     previous: FloatArray
     current: FloatArray
-    track_ids: NDArray[np.int64]
+    track_ids: IntArray
     sought: int
 
     @classmethod
-    def of(
-        cls, before: Pixels, now: Pixels, track_ids: NDArray[np.int64], kept: NDArray[np.bool_]
-    ) -> Self:
+    def of(cls, before: Pixels, now: Pixels, track_ids: IntArray, kept: BoolArray) -> Self:
         """Those ``kept`` ``(M,)`` of corners ``(M, 2)`` that were sought."""
         before_kept, now_kept = (pixels[kept].astype(np.float64) for pixels in (before, now))
         return cls(before_kept, now_kept, track_ids[kept], len(kept))
@@ -221,7 +219,7 @@ class CornerTracker:
 
     def __init__(self) -> None:
         # of the last frames: pixels (M, 2) and the identifiers of their tracks (M,)
-        self._corners: dict[int, tuple[Pixels, NDArray[np.int64]]] = {}
+        self._corners: dict[int, tuple[Pixels, IntArray]] = {}
         self._next_track_id = 0
 
     def track(
@@ -266,7 +264,7 @@ class CornerTracker:
 
         return find
 
-    def _fill(self, frame: Frame, pixels: Pixels, track_ids: NDArray[np.int64]) -> None:
+    def _fill(self, frame: Frame, pixels: Pixels, track_ids: IntArray) -> None:
         """Keep the corners tracked to a frame, and new ones up to the largest number."""
         fresh = new_corners(frame, pixels, MAX_CORNERS - len(pixels), STEP_CORNERS)
         new_ids = self._next_track_id + np.arange(len(fresh))
@@ -281,7 +279,7 @@ class CornerTracker:
 
 def _tracked(
     first: Grey, second: Grey, points: Pixels, predicted_flow: PredictedFlow | None
-) -> tuple[Pixels, NDArray[np.bool_]]:
+) -> tuple[Pixels, BoolArray]:
     """Points ``(M, 2)`` tracked to the second image, and which are reliable ``(M,)``; with wide windows if few."""
     flows = [predicted_flow, None] if predicted_flow else [None]
     pixels, kept = _by_first_flow(first, second, points, flows)
@@ -305,7 +303,7 @@ def _by_first_flow(
     points: Pixels,
     flows: Sequence[PredictedFlow | None],
     side: int = STEP_SEARCH.side,
-) -> tuple[Pixels, NDArray[np.bool_]]:
+) -> tuple[Pixels, BoolArray]:
     """Points ``(M, 2)`` by the first predicted flow, or by none, with which they are found back; which are ``(M,)``."""
     pixels, kept = points.copy(), np.zeros(len(points), dtype=bool)
     for flow in flows:

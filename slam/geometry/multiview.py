@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from slam.geometry.robust import mad_sigma, median
 from slam.geometry.se3 import (
+    BoolArray,
     FloatArray,
     apply,
     compose,
@@ -118,7 +119,7 @@ def resect(
     K: FloatArray,
     seed: int = 0,
     spread: FloatArray | None = None,
-    trusted: NDArray[np.bool_] | None = None,
+    trusted: BoolArray | None = None,
 ) -> Resection:
     """The pose found from the first guess ``T_camera_world``; in doubt that with most inliers, from others too.
 
@@ -146,7 +147,7 @@ def resect(
     return best
 
 
-def _support(pose: Resection, votes: NDArray[np.bool_]) -> int:
+def _support(pose: Resection, votes: BoolArray) -> int:
     return int((pose.residual_px[votes] < INLIER_PX).sum())
 
 
@@ -157,7 +158,7 @@ def _best(
     K: FloatArray,
     seed: int,
     spread: FloatArray | None,
-    votes: NDArray[np.bool_],
+    votes: BoolArray,
 ) -> Resection:
     """The pose by the points that vote ``(M,)``."""
 
@@ -186,7 +187,7 @@ def _refined(
     spread: FloatArray | None,
     pixels: FloatArray,
     K: FloatArray,
-    votes: NDArray[np.bool_],
+    votes: BoolArray,
 ) -> Resection:
     """Cauchy weights of half an inlier; far from the solution, where all residuals are large, of their median."""
     T = T_camera_world.copy()

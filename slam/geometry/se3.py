@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
 
 def make(R_a_b: FloatArray, t_a_b: FloatArray) -> FloatArray:

@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 from slam.formats.trajectory import translations_and_quaternions
 from slam.frames import LOOP_SOURCE, RelativePose
 from slam.geometry.robust import median
-from slam.geometry.se3 import FloatArray, invert, is_se3, make, path_distance
+from slam.geometry.se3 import BoolArray, FloatArray, invert, is_se3, make, path_distance
 from slam.runtime.errors import SlamError
 from slam.runtime.files import write_atomically
 
@@ -215,7 +215,7 @@ class PoseGraph:
             lines.append(f"{_EDGE} {ends} {_numbers(pose)} {_numbers(information)}")
         write_atomically(path, "\n".join([*lines, ""]))
 
-    def _is_loop(self) -> NDArray[np.bool_]:
+    def _is_loop(self) -> BoolArray:
         """Which of the factors ``(F,)`` are loops."""
         return np.array([edge.source == LOOP_SOURCE for edge in self.relative_poses], dtype=bool)
 
@@ -263,7 +263,7 @@ def whitened_squared(
     return np.array(squared)
 
 
-def _outlying(squared: FloatArray) -> NDArray[np.bool_]:
+def _outlying(squared: FloatArray) -> BoolArray:
     """Which whitened squared residuals ``(F,)`` are large, and far above the median as well."""
     typical = median(np.sqrt(squared)) if len(squared) else 0.0
     return squared > max(_LARGEST_RESIDUAL, _OUTLYING * typical) ** 2

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from slam.frames import DepthMap, Image, Intrinsics
 from slam.geometry.robust import median
-from slam.geometry.se3 import FloatArray, apply, invert, length_of, rotation_angle
+from slam.geometry.se3 import BoolArray, FloatArray, apply, invert, length_of, rotation_angle
 from slam.mapping.depth import DepthFilters, KeyframeDepth, sampled
 from slam.runtime.imports import import_open3d
 from slam.runtime.memory import SpilledArray
@@ -71,7 +71,7 @@ class Submap:
     brightness_steps: FloatArray
     camera: FloatArray
 
-    def blocks(self, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+    def blocks(self, chosen: BoolArray) -> tuple[BoolArray, NDArray[np.intp]]:
         """Observed voxels ``(C, 4096)`` of the chosen ``(B,)`` blocks, and their places in ``tsdf``, in order."""
         counts = np.bitwise_count(self.observed).sum(axis=1, dtype=np.int64)
         begins = np.cumsum(counts) - counts

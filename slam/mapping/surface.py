@@ -23,7 +23,7 @@ from erfsfm.common.progress import Progress, silent
 from slam.config.sections import MappingConfig
 from slam.formats.ply import Ply, write_ply_pieces
 from slam.frames import Mask
-from slam.geometry.se3 import FloatArray, length_of
+from slam.geometry.se3 import FloatArray, IntArray, length_of
 from slam.mapping.submap import (
     BLOCK_SIDE,
     TILE_BLOCKS,
@@ -60,10 +60,10 @@ class Piece:
     vertices: SpilledArray
     triangles: SpilledArray
     label: SpilledArray
-    shared: NDArray[np.int64]
+    shared: IntArray
     shared_points: NDArray[np.float32]
-    shared_labels: NDArray[np.int64]
-    sizes: NDArray[np.int64]
+    shared_labels: IntArray
+    sizes: IntArray
 
 
 class MapSurface:
@@ -251,7 +251,7 @@ class TileSurface:
 
 
 def extract_tile(
-    submaps: MergedSubmaps, tile: NDArray[np.int64], voxel_size_m: float, least_weight: float
+    submaps: MergedSubmaps, tile: IntArray, voxel_size_m: float, least_weight: float
 ) -> TileSurface | None:
     """The surface of a tile and of one block around it; None where there is none.
 
@@ -269,7 +269,7 @@ def extract_tile(
     return TileSurface(vertices, triangles, own, np.zeros(len(own), dtype=bool))
 
 
-def in_tile(points: FloatArray, tile: NDArray[np.int64], voxel_size_m: float) -> Mask:
+def in_tile(points: FloatArray, tile: IntArray, voxel_size_m: float) -> Mask:
     """Which points ``(P, 3)`` are in a tile."""
     side = voxel_size_m * BLOCK_SIDE * TILE_BLOCKS
     return np.asarray((np.floor(points / side) == tile).all(axis=1))
@@ -321,11 +321,7 @@ def _sorted(vertices: FloatArray, triangles: Triangles) -> tuple[FloatArray, Tri
 
 
 def with_holes_closed(
-    patch: TileSurface,
-    tile: NDArray[np.int64],
-    voxel_size_m: float,
-    up_world: FloatArray,
-    largest_m: float,
+    patch: TileSurface, tile: IntArray, voxel_size_m: float, up_world: FloatArray, largest_m: float
 ) -> TileSurface:
     """Close holes of at most ``largest_m`` across by triangles around a new vertex in their middle.
 
@@ -375,7 +371,7 @@ def _is_small_and_flat(corners: FloatArray, up_world: FloatArray, largest_m: flo
     return float(np.abs(corners @ area).max()) <= _FLAT * largest_m * size
 
 
-def _rings(triangles: Triangles, upwards: FloatArray) -> list[NDArray[np.int64]]:
+def _rings(triangles: Triangles, upwards: FloatArray) -> list[IntArray]:
     """Closed rings of open edges, each vertex once, in the direction of the triangles beside them.
 
     Those of at most 100 edges whose vertices look upwards in the mean; ``upwards`` ``(V,)`` are cosines.
@@ -407,7 +403,7 @@ def _rings(triangles: Triangles, upwards: FloatArray) -> list[NDArray[np.int64]]
     return rings
 
 
-def _open_edges(triangles: Triangles, vertices: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _open_edges(triangles: Triangles, vertices: int) -> tuple[IntArray, IntArray]:
     """Begins and ends of the edges of one triangle alone, in its direction."""
     begin, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
     low, high = np.minimum(begin, end), np.maximum(begin, end)

@@ -18,7 +18,7 @@ from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.frontend.keyframes.submaps import join
 from slam.frontend.scale import Scale
-from slam.geometry.se3 import FloatArray, invert, length_of, make, path_distance
+from slam.geometry.se3 import BoolArray, FloatArray, invert, length_of, make, path_distance
 from slam.graph.pose_graph import optimise_similarities
 from slam.loops.closure import LoopClosures, Track, find_loops, most_inliers_first
 from slam.loops.verification import OF_KEYFRAMES, Loop, LoopVerifier
@@ -140,7 +140,7 @@ class _Rows:
             views += segment.views(np.where(settled, segment.points, np.nan))
         return views
 
-    def apart(self) -> NDArray[np.bool_]:
+    def apart(self) -> BoolArray:
         """Which keyframes share few tracks ``(K, K)``."""
         first = np.cumsum([0, *(len(segment.points) for segment in self.segments)])
         tracks = [

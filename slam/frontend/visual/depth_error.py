@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from slam.frames import DepthMap
 from slam.geometry.robust import weighted_median
-from slam.geometry.se3 import FloatArray
+from slam.geometry.se3 import FloatArray, IntArray
 
 # learned depth is counted in half octaves, in the unit of the networks
 _DEPTHS = 2.0 ** np.arange(-6.0, 9.0, 0.5)
@@ -155,7 +155,7 @@ class DepthError:
         return np.array([np.interp(share, row, edges) for row in cumulative])
 
 
-def _nearest(values: FloatArray, places: NDArray[np.floating[Any]]) -> NDArray[np.int64]:
+def _nearest(values: FloatArray, places: NDArray[np.floating[Any]]) -> IntArray:
     """Row of the nearest of evenly spaced ``places`` ``(P,)`` for values ``(M,)``, beyond its ends the last."""
     rows = np.rint((values - places[0]) / (places[1] - places[0]))
     return np.asarray(np.clip(rows, 0, len(places) - 1), np.int64)

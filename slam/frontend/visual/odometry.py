@@ -17,7 +17,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.frames import (
     DepthMap,
@@ -54,7 +53,7 @@ from slam.geometry.multiview import (
     triangulated_nearness,
 )
 from slam.geometry.robust import MAD_TO_SIGMA, mad_sigma, median, weighted_median
-from slam.geometry.se3 import FloatArray, apply, invert, length_of, make
+from slam.geometry.se3 import BoolArray, FloatArray, IntArray, apply, invert, length_of, make
 from slam.runtime.errors import Failed
 
 logger = logging.getLogger(__name__)
@@ -125,7 +124,7 @@ class VisualOdometry:
         self._points: tuple[int, TriangulatedPoints | None] = (-1, None)
         # tracks that fitted the last motion have the vote on the next one: what passes between the
         # camera and the world never did, however many corners it has
-        self._fitted: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._fitted: IntArray = np.zeros(0, np.int64)
 
     def measure(
         self,
@@ -219,7 +218,7 @@ class VisualOdometry:
     def _matches(
         self,
         tracks: Tracks,
-        votes: NDArray[np.bool_],
+        votes: BoolArray,
         learned: FloatArray,
         height: float | None,
         mask: DynamicMask,
@@ -240,12 +239,7 @@ class VisualOdometry:
         return Matches(rays_previous, rays_current, depth, sigma, on_road, weights, votes, focal_px)
 
     def _still(
-        self,
-        ends: Ends,
-        seconds: float,
-        tracks: Tracks,
-        votes: NDArray[np.bool_],
-        depth: FloatArray,
+        self, ends: Ends, seconds: float, tracks: Tracks, votes: BoolArray, depth: FloatArray
     ) -> Motion | None:
         """No motion, None where near corners move: hills and gantries far ahead stand at any speed.
 
@@ -274,7 +268,7 @@ class VisualOdometry:
         self,
         frames: tuple[Frame, Frame],
         tracks: Tracks,
-        votes: NDArray[np.bool_],
+        votes: BoolArray,
         learned: FloatArray,
         height: float | None,
     ) -> Motion | Failed | None:
@@ -398,7 +392,7 @@ class VisualOdometry:
         return Step(motion, two_view, triangulated)
 
     def _by_points(
-        self, ends: Ends, tracks: Tracks, votes: NDArray[np.bool_], depth: FloatArray
+        self, ends: Ends, tracks: Tracks, votes: BoolArray, depth: FloatArray
     ) -> Motion | Failed:
         """Perspective-n-point of the later image's corners on the earlier frame's learned depth."""
         known = np.isfinite(depth)
@@ -446,7 +440,7 @@ class TriangulatedPoints:
     is that of both.
     """
 
-    track_ids: NDArray[np.int64]
+    track_ids: IntArray
     depth_previous: FloatArray
     depth_current: FloatArray
     relative_sigma: FloatArray

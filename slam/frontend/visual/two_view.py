@@ -32,7 +32,7 @@ from slam.geometry.multiview import (
     unit_pose_by_pnp,
 )
 from slam.geometry.robust import mad_sigma, weighted_median
-from slam.geometry.se3 import FloatArray, compose, rotation_matrix
+from slam.geometry.se3 import BoolArray, FloatArray, IntArray, compose, rotation_matrix
 
 _ITERATIONS = 10
 # over-relaxation: reweighting alone converges by half of the distance an iteration
@@ -93,9 +93,9 @@ class Matches:
     rays_current: FloatArray
     depth_previous: FloatArray
     depth_sigma: FloatArray
-    on_road: NDArray[np.bool_]
+    on_road: BoolArray
     weights: FloatArray
-    votes: NDArray[np.bool_]
+    votes: BoolArray
     focal_px: float
 
     def by_geometry_alone(self) -> Matches:
@@ -142,8 +142,8 @@ class TwoViewEstimate:
     unit_pose: UnitRelativePose
     covariance: FloatArray
     noise_px: float
-    inliers: NDArray[np.bool_]
-    agreeing: NDArray[np.bool_]
+    inliers: BoolArray
+    agreeing: BoolArray
 
 
 def estimate(matches: Matches, history: MotionHistory, seed: int = 0) -> TwoViewEstimate | None:
@@ -244,12 +244,8 @@ def _refined(
 
 
 def _inliers(
-    matches: Matches,
-    near: NDArray[np.bool_],
-    shift_px: FloatArray,
-    seen_px: FloatArray,
-    parallax_px: float,
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    matches: Matches, near: BoolArray, shift_px: FloatArray, seen_px: FloatArray, parallax_px: float
+) -> tuple[BoolArray, BoolArray]:
     """Which corners near their epipolar lines fit learned depth ``(M,)``, and which are inliers ``(M,)``.
 
     The majority of the parallax in the image decides on the length by which learned depth is
@@ -284,7 +280,7 @@ def _with_first_sigma(matches: Matches, motions: Sequence[UnitRelativePose | Non
     return replace(matches, depth_sigma=np.maximum(matches.depth_sigma, error))
 
 
-def _support(candidate: TwoViewEstimate, votes: NDArray[np.bool_], prior: MotionPrior) -> float:
+def _support(candidate: TwoViewEstimate, votes: BoolArray, prior: MotionPrior) -> float:
     """Number of votes of inliers that agree with learned depth, less the cost of leaving the usual axis."""
     deviation = prior.deviation(candidate.unit_pose.direction)
     return float(candidate.agreeing[votes].sum()) - 0.5 * deviation**2 / _OUTLIER_COST
@@ -407,7 +403,7 @@ class DynamicMask:
             np.minimum(ratio[self._cells(pixels)] / max(usual, 1e-3), 1.0) ** _SHARPNESS
         )
 
-    def updated(self, pixels: FloatArray, is_inlier: NDArray[np.bool_]) -> Self:
+    def updated(self, pixels: FloatArray, is_inlier: BoolArray) -> Self:
         """The mask after one more step, whose corners now lie at ``pixels`` ``(M, 2)``."""
         inliers, corners = _KEPT * self.inliers, _KEPT * self.corners
         cells = self._cells(pixels)
@@ -415,7 +411,7 @@ class DynamicMask:
         np.add.at(inliers, cells, is_inlier.astype(float))
         return type(self)(inliers, corners)
 
-    def _cells(self, pixels: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def _cells(self, pixels: FloatArray) -> tuple[IntArray, IntArray]:
         column, row = (np.floor(pixels.T / _CELL_PX)).astype(np.int64)
         height, width = self.corners.shape
         return np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
@@ -423,12 +419,12 @@ class DynamicMask:
 
 def moving_corners(
     pixels: FloatArray,
-    on_road: NDArray[np.bool_],
-    agreeing: NDArray[np.bool_],
-    contradicting: NDArray[np.bool_],
+    on_road: BoolArray,
+    agreeing: BoolArray,
+    contradicting: BoolArray,
     expected_px: FloatArray,
     seen_px: FloatArray,
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Which of the contradicting corners ``(M,)`` lie in a region that moves.
 
     Args:

@@ -37,7 +37,6 @@ _USUAL_SUPPORT, _SUPPORT_SPREAD = 0.6, 0.13
 _WEAK_SUPPORT, _LEAST_WEAK = 0.2, 10  # and frames in a row that are a doubt
 _ON_ROAD, _ON_ROAD_SPREAD = 1.0, 0.2
 _FAR_SPREAD = 0.18  # of the logarithm
-_FAR_CORNERS = 0.05  # least corners over the most of a distance
 _CONTRADICTED_SPREAD = 0.007
 _LEAST_MOVED = 0.1  # of long steps
 _LEAST_APART = 0.1  # between poses whose directions are compared: shorter steps are noise
@@ -236,7 +235,7 @@ def of_images(
         sigmas = (_ON_ROAD - on_road / steps) / _ON_ROAD_SPREAD
         figure = f"{on_road} of {steps} lengths were measured on the road; the others follow from learned depth"
         compared("the view of the road", sigmas, figure)
-    too_far = drive.measured.depth_error.most_too_far(_FAR_CORNERS)
+    too_far = drive.measured.depth_error.most_too_far()
     if needs_road and steps and too_far is not None:
         figure = f"it is up to {100 * np.expm1(too_far):.0f} % farther than triangulated, as where a lens zooms"
         compared("learned depth far away", too_far / _FAR_SPREAD, figure)

@@ -102,7 +102,7 @@ class DepthFilters:
             ~self._is_sky(view.image) | is_exact,
             (depth >= config.depth_min_m) & (depth < farthest),
             everything if view.relative_sigma is None else sigma <= MOST_RELATIVE_SIGMA,
-            ~_at_edges(self.trusted(view), _MAX_DEPTH_STEP) | is_exact,
+            ~_at_edges(self.trusted(view)) | is_exact,
             np.any([self._agrees(view, other) for other in others], axis=0)
             if others
             else everything,
@@ -179,7 +179,7 @@ def sampled(image: NDArray[Any], u: DepthMap, v: DepthMap) -> NDArray[Any]:
     )
 
 
-def _at_edges(depth: DepthMap, max_step: float) -> Mask:
+def _at_edges(depth: DepthMap) -> Mask:
     """Pixels on either side of a relative depth step, where networks blur depth."""
     edges = np.zeros(depth.shape, dtype=bool)
     for near, far in (
@@ -187,7 +187,7 @@ def _at_edges(depth: DepthMap, max_step: float) -> Mask:
         ((slice(1, None),), (slice(-1),)),
     ):
         a, b = depth[near], depth[far]
-        step = np.abs(a - b) > max_step * np.minimum(a, b)
+        step = np.abs(a - b) > _MAX_DEPTH_STEP * np.minimum(a, b)
         edges[near] |= step
         edges[far] |= step
     return edges

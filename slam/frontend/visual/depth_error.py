@@ -32,6 +32,7 @@ _PRIOR_SIGMA = 0.2
 _LEAST_SIGMA = 0.1
 _USUAL_SIGMA = 0.15
 _USUAL_FAR_SIGMA = 0.25
+_FAR_CORNERS = 0.05  # least corners over the most of a distance
 # what moves along with the camera, as a car beside it, is triangulated far behind its place: that is
 # no error of learned depth
 _LEAST_RATIO = float(np.exp(_LOGARITHMS[0]))
@@ -101,15 +102,11 @@ class DepthError:
         np.add.at(noise, depths, weights * spread)
         return type(self)(corners, noise)
 
-    def most_too_far(self, least: float) -> float | None:
-        """The largest bias towards far, less where the depth there scatters more than usual; None without corners.
-
-        Args:
-            least: corners at a distance, over the most at any, that its bias counts.
-        """
+    def most_too_far(self) -> float | None:
+        """The largest bias towards far, less where the depth there scatters more than usual; None without corners."""
         corners = self.corners.sum(axis=1)
         bias = self.bias / np.maximum(self._spread / _USUAL_FAR_SIGMA, 1.0)
-        counted = bias[corners > least * corners.max()]
+        counted = bias[corners > _FAR_CORNERS * corners.max()]
         return float(counted.max()) if len(counted) else None
 
     def curve(self) -> list[tuple[float, float, float, float]]:

@@ -18,7 +18,7 @@ from scipy.linalg import solveh_banded
 from scipy.spatial import cKDTree
 
 from slam.frames import DepthMap, Image, Intrinsics
-from slam.geometry.robust import median
+from slam.geometry.robust import difference_equations, median
 from slam.geometry.se3 import BoolArray, FloatArray, apply, invert, length_of, rotation_angle
 from slam.mapping.depth import DepthFilters, KeyframeDepth, sampled
 from slam.runtime.imports import import_open3d
@@ -390,14 +390,13 @@ def evened(brightness_steps: FloatArray) -> FloatArray:
     if count < 2:
         return np.zeros(count)
     steps = brightness_steps[1:]
-    known = np.isfinite(steps)
-    steps = np.where(known, steps, 0.0)
-    banded, right = np.zeros((2, count)), np.zeros(count)
-    banded[1] = _EXPOSURE_PRIOR
-    banded[1, 1:] += known
-    banded[1, :-1] += known
-    banded[0, 1:] = -known.astype(float)
-    right[1:] += steps
-    right[:-1] -= steps
-    solved: FloatArray = solveh_banded(banded, right)
+    known, views = np.isfinite(steps), np.arange(count)
+    information, right = difference_equations(
+        views[1:],
+        views[:-1],
+        np.where(known, steps, 0.0),
+        known.astype(float),
+        np.full(count, _EXPOSURE_PRIOR),
+    )
+    solved: FloatArray = solveh_banded(information[1:], right)
     return solved

@@ -61,8 +61,6 @@ class Piece:
     triangles: SpilledArray
     label: SpilledArray
     shared: IntArray
-    shared_points: NDArray[np.float32]
-    shared_labels: IntArray
     sizes: IntArray
 
 
@@ -87,7 +85,7 @@ class MapSurface:
         painter = Painter(submaps, config.voxel_size_m, config.reach_m)
         tiles = submaps.tiles()
         for done, tile in enumerate(tiles, 1):
-            patch = extract_tile(submaps, tile, config.voxel_size_m, _LEAST_WEIGHT)
+            patch = extract_tile(submaps, tile, config.voxel_size_m)
             if patch is not None and config.close_holes_m > 0:
                 # upwards in the camera of the view nearest to the tile
                 middle = (tile + 0.5) * TILE_BLOCKS * BLOCK_SIDE * config.voxel_size_m
@@ -182,8 +180,6 @@ def _piece(patch: TileSurface, painter: Painter, spill: SpillFile) -> Piece:
         put(triangles),
         put(label.astype(np.int32)),
         shared,
-        np.stack([vertices[name][shared] for name in ("x", "y", "z")], axis=1),
-        label[shared].astype(np.int64),
         np.bincount(label[triangles[:, 0]], minlength=parts),
     )
 
@@ -198,8 +194,10 @@ def _numbered(
         that is its own: those before are an earlier piece's. And how many triangles are kept.
     """
     begin = np.cumsum([0, *(len(piece.sizes) for piece in pieces)])
-    points = np.concatenate([piece.shared_points for piece in pieces])
-    part = np.concatenate([first + piece.shared_labels for first, piece in zip(begin, pieces)])
+    points = np.concatenate([Ply(piece.vertices.read()).points[piece.shared] for piece in pieces])
+    part = np.concatenate(
+        [first + piece.label.read()[piece.shared] for first, piece in zip(begin, pieces)]
+    )
     _, earliest, group = np.unique(points, axis=0, return_index=True, return_inverse=True)
     group = group.ravel()
     link = coo_array(
@@ -250,16 +248,14 @@ class TileSurface:
         )
 
 
-def extract_tile(
-    submaps: MergedSubmaps, tile: IntArray, voxel_size_m: float, least_weight: float
-) -> TileSurface | None:
+def extract_tile(submaps: MergedSubmaps, tile: IntArray, voxel_size_m: float) -> TileSurface | None:
     """The surface of a tile and of one block around it; None where there is none.
 
     Both sides of a border between tiles see the same voxels, so that vertices there are the same bit by bit. A triangle
     belongs to the tile that its centre is in.
     """
     low = tile * TILE_BLOCKS
-    mesh = _extract(*submaps.merged(low - 1, low + TILE_BLOCKS + 1), voxel_size_m, least_weight)
+    mesh = _extract(*submaps.merged(low - 1, low + TILE_BLOCKS + 1), voxel_size_m)
     if mesh is None:
         return None
     vertices, triangles = _sorted(*mesh)
@@ -276,11 +272,7 @@ def in_tile(points: FloatArray, tile: IntArray, voxel_size_m: float) -> Mask:
 
 
 def _extract(
-    keys: Keys,
-    tsdf: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    voxel_size_m: float,
-    least_weight: float,
+    keys: Keys, tsdf: NDArray[np.float32], weight: NDArray[np.float32], voxel_size_m: float
 ) -> tuple[FloatArray, Triangles] | None:
     o3d = import_open3d()
     grid: Any = new_grid(voxel_size_m, len(keys))
@@ -290,7 +282,7 @@ def _extract(
         grid.attribute(name).numpy()[places.numpy()] = values.reshape(shape)
     try:
         # a frame weighs 1
-        mesh = grid.extract_triangle_mesh(least_weight - 0.5)
+        mesh = grid.extract_triangle_mesh(_LEAST_WEIGHT - 0.5)
     except RuntimeError:  # Open3D cannot build an empty geometry
         return None
     if mesh.is_empty() or not len(mesh.triangle.indices):

@@ -17,11 +17,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any, Self
+from typing import Self
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from scipy import ndimage
 
 from slam.frontend.visual.history import AXIS_SIGMA, MotionHistory, MotionPrior
 from slam.geometry.multiview import (
@@ -450,18 +450,9 @@ def moving_corners(
     parallax = np.where(agreeing | contradicting, np.abs(seen_px), 0.0)
     on_road_px = np.bincount(region, (parallax * on_road)[contradicting], count)
     is_most_of_road = on_road_px > _LARGEST_SHARE * parallax[on_road].sum()
-    middle = _medians(motion, region, count)
-    scatter = _medians(np.abs(motion - middle[region]), region, count)
+    regions = np.arange(count)
+    middle = ndimage.median(motion, region, regions)
+    scatter = ndimage.median(np.abs(motion - middle[region]), region, regions)
     moving[contradicting] = (~is_most_of_road & (scatter < _CONSISTENCY * np.abs(middle)))[region]
     is_most = parallax[moving].sum() > _LARGEST_SHARE * parallax.sum()
     return np.zeros_like(moving) if is_most else moving
-
-
-def _medians(values: FloatArray, groups: NDArray[np.integer[Any]], count: int) -> FloatArray:
-    """The median of the values ``(K,)`` of each group, ``(count,)``; 0 of an empty one."""
-    order, sizes = np.lexsort((values, groups)), np.bincount(groups, minlength=count)
-    first, last = np.cumsum(sizes) - sizes, len(values) - 1
-    below, above = (
-        np.minimum(first + np.maximum(half, 0), last) for half in ((sizes - 1) // 2, sizes // 2)
-    )
-    return np.where(sizes > 0, 0.5 * (values[order[below]] + values[order[above]]), 0.0)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.readers.camera_file import Pinhole
-from slam.geometry.se3 import FloatArray, invert
+from slam.geometry.se3 import BoolArray, FloatArray, invert
 
 T = TypeVar("T")
 _Kind = TypeVar("_Kind", bound=np.generic)
@@ -97,7 +97,7 @@ class Frame:
         known: T = self._derived[key]
         return known
 
-    def is_fixed(self, pixels: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
+    def is_fixed(self, pixels: NDArray[np.floating[Any]]) -> BoolArray:
         """Which pixels ``(M, 2)`` show what is fixed to the camera ``(M,)``."""
         if self.fixed is None:
             return np.zeros(len(pixels), np.bool_)

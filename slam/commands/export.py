@@ -22,6 +22,7 @@ from slam.formats.ply import R_UP_WORLD, Ply, read_ply, rotated, write_ply
 from slam.formats.trajectory import Trajectory, nearest_stamps, read_trajectory
 from slam.frames import Intrinsics
 from slam.geometry import se3
+from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray
 from slam.loops.places import Places, PlaceStructure
 from slam.loops.verification import OF_KEYFRAMES
@@ -279,7 +280,7 @@ def _write_images(
             "%d of %d frames have no usable image: left out", len(rows) - len(written), len(rows)
         )
     # for erfsfm train, which takes images without distortion alone
-    rate = 1.0 / float(np.median(np.diff(sequence.stamps)))
+    rate = 1.0 / median(np.diff(sequence.stamps))
     seen = sequence.intrinsics
     camera = CameraFile(**vars(Pinhole.of(seen)), fps=rate, fx_sigma=seen.focal_sigma)
     write_camera(output, camera, sequence.fixed)

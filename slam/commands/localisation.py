@@ -20,8 +20,8 @@ from erfsfm.common.table import DASH, Table
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.frames import Frame, Image, Intrinsics, Mask, View
 from slam.geometry.multiview import Resection, consensus, pixel_jacobian, resect
-from slam.geometry.robust import mad_sigma
-from slam.geometry.se3 import FloatArray, apply, invert
+from slam.geometry.robust import mad_sigma, median
+from slam.geometry.se3 import FloatArray, apply, invert, length_of
 from slam.loops.features import FeatureExtractor, hamming
 from slam.loops.places import Places, PlaceStructure
 from slam.loops.verification import OF_FRAMES, OF_KEYFRAMES, matches
@@ -265,8 +265,8 @@ class Localiser:
         if count < max(_LEAST_INLIERS, _LEAST_RATIO * len(inliers)):
             return Localisation(reason=f"only {count} of {len(inliers)} corners agree")
         points, pixels = points[inliers], pixels[inliers]
-        depth = float(np.median(apply(T_camera_world, points)[:, 2]))
-        sigma = float(np.linalg.norm(pose.sigmas[3:])) / depth
+        depth = median(apply(T_camera_world, points)[:, 2])
+        sigma = length_of(pose.sigmas[3:]) / depth
         if sigma > _MOST_SIGMA:
             return Localisation(
                 reason=f"{count} corners agree, but give the position to {sigma:.1%} of their depth"

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from slam.geometry.robust import median, rms
 from slam.runtime.errors import Failed
 from slam.runtime.record import Count, Record
 
@@ -94,8 +95,8 @@ class DepthErrors:
             }
         return DepthMetrics.of(
             abs_rel=float(relative.mean()),
-            median_rel=float(np.median(relative)),
-            rmse_m=float(np.sqrt(np.square(depth - truth).mean())),
+            median_rel=median(relative),
+            rmse_m=rms(depth - truth),
             a1=float((ratio < 1.25).mean()),
             by_range=by_range,
             coverage=coverage,

@@ -22,7 +22,16 @@ from scipy.spatial import cKDTree
 
 from slam.formats.ply import scene_of
 from slam.frames import Mask
-from slam.geometry.se3 import FloatArray, Similarity, apply, nearest_rotation, path_distance
+from slam.geometry.robust import median
+from slam.geometry.se3 import (
+    FloatArray,
+    IntArray,
+    Similarity,
+    apply,
+    length_of,
+    nearest_rotation,
+    path_distance,
+)
 from slam.mapping.submap import moved_rows
 from slam.runtime.errors import Failed
 from slam.runtime.imports import import_open3d
@@ -221,7 +230,7 @@ def pose_similarity(
     R_true, R_estimate = T_world_camera_true[:, :3, :3], T_world_camera[:, :3, :3]
     true, estimate = T_world_camera_true[:, :3, 3], T_world_camera[:, :3, 3]
     centred_true, centred = true - true.mean(axis=0), estimate - estimate.mean(axis=0)
-    size_true, size = float(np.linalg.norm(centred_true)), float(np.linalg.norm(centred))
+    size_true, size = length_of(centred_true), length_of(centred)
     rough = size_true / size if with_scale and size > 0 else 1.0
     turns = (R_true @ np.swapaxes(R_estimate, 1, 2)).sum(axis=0)
     R = nearest_rotation(rough * centred_true.T @ centred + _LEVER_M**2 * turns)
@@ -309,7 +318,7 @@ def _errors(own: FloatArray, true: FloatArray, least: int) -> dict[str, Any]:
     precision = {key: no_map or _share(own <= within) for key, within in F_SCORES_M.items()}
     recall = {key: no_surface or _share(true <= within) for key, within in F_SCORES_M.items()}
     return {
-        "accuracy_median_m": no_map or float(np.median(own)),
+        "accuracy_median_m": no_map or median(own),
         "accuracy_90_m": no_map or float(np.quantile(own, 0.9)),
         "outlier_share": no_map or _share(own > OUTLIER_M),
         "completeness": no_surface or _share(true <= COVERED_WITHIN_M),
@@ -369,7 +378,7 @@ def _to_map(samples: FloatArray, points: FloatArray) -> FloatArray:
     return cKDTree(near).query(samples, distance_upper_bound=OUTLIER_M)[0]
 
 
-def double_wall_share(pieces: Iterable[tuple[FloatArray, NDArray[np.int64]]]) -> float:
+def double_wall_share(pieces: Iterable[tuple[FloatArray, IntArray]]) -> float:
     """Share of the area with a parallel surface 0.3 to 2 m before it; NaN without any area.
 
     Args:

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from slam.formats.trajectory import Trajectory
 from slam.geometry import se3
-from slam.geometry.se3 import FloatArray
+from slam.geometry.robust import median
+from slam.geometry.se3 import FloatArray, interpolated, length_of
 
 _BETTER = 3.0  # times; what fits by chance is nearer
 _MOST_GAIN = 1000.0  # times; what is beyond is rounding
@@ -124,21 +125,18 @@ def _clock(estimate: Trajectory, reference: Trajectory) -> tuple[float, float, f
     """The shift of the estimate's stamps that fits best, seconds or frames, and the errors without and with it."""
     every = max(len(estimate) // _MOST_POSES, 1)
     stamps, positions = estimate.stamps[::every], estimate.positions[::every]
-    unmatched = float(np.linalg.norm(np.ptp(reference.positions, axis=0)))
+    unmatched = length_of(np.ptp(reference.positions, axis=0))
 
     def error(shift_s: float) -> float:
         times = stamps + shift_s
         inside = (times >= reference.stamps[0]) & (times <= reference.stamps[-1])
         if inside.sum() < max(_LEAST_OVERLAP * len(times), _LEAST_POSES):
             return unmatched
-        truth = [
-            np.interp(times[inside], reference.stamps, reference.positions[:, axis])
-            for axis in range(3)
-        ]
-        return _ate(positions[inside], np.column_stack(truth))
+        truth = interpolated(times[inside], reference.stamps, reference.positions)
+        return _ate(positions[inside], truth)
 
     most = min(_LONGEST_SHIFT_S, stamps[-1] - stamps[0])
-    step = max(float(np.median(np.diff(estimate.stamps))), most / _MOST_SHIFTS)
+    step = max(median(np.diff(estimate.stamps)), most / _MOST_SHIFTS)
     shifts = np.arange(-most, most + step, step)
     near = float(shifts[np.argmin([error(shift) for shift in shifts])])
     found = minimize_scalar(error, bounds=(near - step, near + step), method="bounded")

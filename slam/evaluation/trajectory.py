@@ -22,6 +22,7 @@ from erfsfm.evaluation.pose_metrics import SnippetErrors, snippet_errors, snippe
 from slam.formats.rows import number_or_nan
 from slam.formats.trajectory import Trajectory, associate, matching_tolerance_s, read_trajectory
 from slam.geometry import se3
+from slam.geometry.robust import rms
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import ConfigError, Failed, TrajectoryError
 from slam.runtime.files import REFERENCE
@@ -174,13 +175,9 @@ class Statistic(NamedTuple):
     formula: Callable[[Aligned], float | Failed]
 
 
-def _rmse(errors: FloatArray) -> float:
-    return float(np.sqrt((errors**2).mean()))
-
-
 def _ate(pair: Aligned) -> float:
     offsets = pair.T_world_estimate[:, :3, 3] - pair.T_world_reference[:, :3, 3]
-    return _rmse(np.linalg.norm(offsets, axis=1))
+    return rms(np.linalg.norm(offsets, axis=1))
 
 
 _T_REL = Statistic(
@@ -193,8 +190,8 @@ _R_REL = Statistic(
 )
 _RPE_M = Statistic("RPE\nm", 4, lambda pair: float(pair.step_errors[0].mean()))
 _RPE_DEG = Statistic("RPE\ndeg", 4, lambda pair: float(np.rad2deg(pair.step_errors[1].mean())))
-_RPE_RMSE_M = Statistic("rmse\nm", 4, lambda pair: _rmse(pair.step_errors[0]))
-_RPE_RMSE_DEG = Statistic("rmse\ndeg", 4, lambda pair: _rmse(np.rad2deg(pair.step_errors[1])))
+_RPE_RMSE_M = Statistic("rmse\nm", 4, lambda pair: rms(pair.step_errors[0]))
+_RPE_RMSE_DEG = Statistic("rmse\ndeg", 4, lambda pair: rms(np.rad2deg(pair.step_errors[1])))
 
 
 class AlignedMetrics(Record):

@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.geometry.se3 import FloatArray
+from slam.geometry.se3 import FloatArray, IntArray
 from slam.runtime.errors import RunError
 from slam.runtime.files import write_atomically
 from slam.runtime.imports import import_open3d
@@ -33,7 +33,7 @@ class Ply:
     """Vertices as a structured array ``(V,)`` with the fields of the file, and triangles ``(T, 3)`` or None."""
 
     vertices: NDArray[np.void]
-    triangles: NDArray[np.int64] | None = None
+    triangles: IntArray | None = None
 
     def columns(self, names: tuple[str, ...]) -> FloatArray | None:
         """Fields of the vertices ``(V, len(names))``; None where the file lacks one of them."""
@@ -135,7 +135,7 @@ def write_ply_pieces(
     vertices: int,
     vertex_pieces: Iterable[NDArray[np.void]],
     triangles: int | None = None,
-    triangle_pieces: Iterable[NDArray[np.int64]] = (),
+    triangle_pieces: Iterable[IntArray] = (),
 ) -> None:
     """Write a binary PLY, atomically, without its whole content in memory.
 

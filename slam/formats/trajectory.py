@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.formats.rows import BadRows, in_seconds, is_number, rows_of
 from slam.geometry import se3
+from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import TrajectoryError
 from slam.runtime.files import write_atomically
@@ -293,7 +294,7 @@ def matching_tolerance_s(estimate: Trajectory, reference: Trajectory) -> float:
 
 
 def _period_s(trajectory: Trajectory) -> float:
-    return float(np.median(np.diff(trajectory.stamps))) if len(trajectory) > 1 else _LONE_PERIOD_S
+    return median(np.diff(trajectory.stamps)) if len(trajectory) > 1 else _LONE_PERIOD_S
 
 
 def nearest_pairs(

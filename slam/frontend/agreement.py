@@ -19,7 +19,7 @@ from slam.frontend.measured import named
 from slam.frontend.self_calibration import SURE, FoundCamera, check_camera
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.motion import Motion
-from slam.geometry.robust import mad_sigma
+from slam.geometry.robust import mad_sigma, median
 from slam.geometry.se3 import FloatArray, invert, path_distance, rotation_angle
 from slam.runtime.errors import Failed, SlamError
 
@@ -37,7 +37,6 @@ _USUAL_SUPPORT, _SUPPORT_SPREAD = 0.6, 0.13
 _WEAK_SUPPORT, _LEAST_WEAK = 0.2, 10  # and frames in a row that are a doubt
 _ON_ROAD, _ON_ROAD_SPREAD = 1.0, 0.2
 _FAR_SPREAD = 0.18  # of the logarithm
-_FAR_CORNERS = 0.05  # least corners over the most of a distance
 _CONTRADICTED_SPREAD = 0.007
 _LEAST_MOVED = 0.1  # of long steps
 _LEAST_APART = 0.1  # between poses whose directions are compared: shorter steps are noise
@@ -137,8 +136,8 @@ def of_steps(
     apart = np.arccos(np.clip(along, -1, 1))
     of_direction = np.hypot(_DIRECTION_RAD, np.arctan2(noise[:, 3:].max(axis=1), length_source))
     sigmas = max(
-        float(np.median(turned / np.hypot(_ROTATION_RAD, np.linalg.norm(noise[:, :3], axis=1)))),
-        float(np.median(apart / of_direction)),
+        median(turned / np.hypot(_ROTATION_RAD, np.linalg.norm(noise[:, :3], axis=1))),
+        median(apart / of_direction),
     )
     degrees = np.rad2deg([np.median(turned), np.median(apart)])
     return Agreement(
@@ -160,11 +159,11 @@ def of_positions(
         path_m: length of the path, of which an alignment keeps a small part as drift.
     """
     noise = np.hypot(sigmas, _DRIFT * path_m)
-    median = float(np.median(distances))
+    usual = median(distances)
     return Agreement(
         source,
         mad_sigma(distances / noise),
-        f"its positions lie {median:.1f} m off the path, median",
+        f"its positions lie {usual:.1f} m off the path, median",
     )
 
 
@@ -236,7 +235,7 @@ def of_images(
         sigmas = (_ON_ROAD - on_road / steps) / _ON_ROAD_SPREAD
         figure = f"{on_road} of {steps} lengths were measured on the road; the others follow from learned depth"
         compared("the view of the road", sigmas, figure)
-    too_far = drive.measured.depth_error.most_too_far(_FAR_CORNERS)
+    too_far = drive.measured.depth_error.most_too_far()
     if needs_road and steps and too_far is not None:
         figure = f"it is up to {100 * np.expm1(too_far):.0f} % farther than triangulated, as where a lens zooms"
         compared("learned depth far away", too_far / _FAR_SPREAD, figure)
@@ -313,4 +312,4 @@ def share_right(sigmas: FloatArray | float, constants: tuple[float, float, float
         constants: the best share, the sigmas that halve it, and how steeply it falls.
     """
     best, half, steepness = constants
-    return np.asarray(best / (1.0 + (np.maximum(sigmas, 0.0) / half) ** steepness))
+    return best / (1.0 + (np.maximum(sigmas, 0.0) / half) ** steepness)

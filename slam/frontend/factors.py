@@ -24,7 +24,7 @@ from slam.frontend.network_motion import (
 )
 from slam.frontend.scale import Scale
 from slam.frontend.visual.noise import step_noise
-from slam.geometry.se3 import FloatArray, compose, equal_step, invert, rigid
+from slam.geometry.se3 import FloatArray, compose, equal_step, invert, length_of, rigid
 
 logger = logging.getLogger(__name__)
 
@@ -140,7 +140,7 @@ def join_gap_ends(
         T_end_last = reduce(np.matmul, (T_step[k] for k in range(end + 1, last)), np.eye(4))
         T_first_last = invert(T_map_camera[first]) @ T_map_camera[last]
         T = equal_step(invert(T_first_begin) @ T_first_last @ invert(T_end_last), end + 1 - begin)
-        length = float(np.linalg.norm(T[:3, 3]))
+        length = length_of(T[:3, 3])
         for k in range(begin, end + 1):
             sigmas = np.maximum(loose[k].sigmas, [0.0, 0.0, 0.0, length, length, length])
             loose[k] = replace(loose[k], T_from_to=T, sigmas=sigmas)

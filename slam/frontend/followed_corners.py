@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from slam.frames import Frame
 from slam.frontend.tracking import Search, Texture, are_inside, new_corners, track
 from slam.geometry.robust import median
-from slam.geometry.se3 import FloatArray
+from slam.geometry.se3 import FloatArray, IntArray
 
 # corners of plain walls creep, and windows beyond the border slip: both bend a focal length by 3 %
 _SEARCH = Search(
@@ -32,22 +32,22 @@ class FollowedCorners:
     ``pixel`` is the size of a pixel in half widths.
     """
 
-    keyframe: NDArray[np.int64]
-    point: NDArray[np.int64]
+    keyframe: IntArray
+    point: IntArray
     image: FloatArray
     pixel: float
 
     def __len__(self) -> int:
         return len(self.keyframe)
 
-    def shared(self, keyframe: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def shared(self, keyframe: int) -> tuple[IntArray, IntArray]:
         """Rows of the points that the keyframe before shows as well, in that and in this one."""
         before = np.flatnonzero(self.keyframe == keyframe - 1)
         own = np.flatnonzero(self.keyframe == keyframe)
         _, first, second = np.intersect1d(self.point[before], self.point[own], return_indices=True)
         return before[first], own[second]
 
-    def chosen(self, rows: NDArray[Any], least: int) -> tuple[FollowedCorners, NDArray[np.int64]]:
+    def chosen(self, rows: NDArray[Any], least: int) -> tuple[FollowedCorners, IntArray]:
         """Those of points that keep so many, numbered anew, and the points that are kept."""
         keyframe, point, image = self.keyframe[rows], self.point[rows], self.image[rows]
         often = np.bincount(point)[point] >= least
@@ -62,13 +62,13 @@ class CornerRecord:
         self._last, self._last_ids = np.zeros((0, 2)), np.zeros(0, np.int64)
         self._rows: list[FloatArray] = [np.zeros((0, 4))]
 
-    def is_far(self, ids: NDArray[np.int64], image: FloatArray) -> bool:
+    def is_far(self, ids: IntArray, image: FloatArray) -> bool:
         """Whether corners, by their identifiers ``(M,)`` and in half widths ``(M, 2)``, are far from the keyframe's."""
         _, own, at_last = np.intersect1d(ids, self._last_ids, return_indices=True)
         moved = np.linalg.norm(image[own] - self._last[at_last], axis=1)
         return len(own) <= _KEYFRAME_LOST * len(self._last_ids) or median(moved) >= _KEYFRAME_MOVED
 
-    def keep(self, ids: NDArray[np.int64], image: FloatArray) -> None:
+    def keep(self, ids: IntArray, image: FloatArray) -> None:
         """Make an image a keyframe, with corners as `is_far` has them, unless there are many."""
         keyframe = len(self._rows) - 1
         if keyframe == _MOST_KEYFRAMES:

@@ -16,7 +16,16 @@ from slam.frontend.keyframes.relative_poses import NO_MAPS, KeyframePoses
 from slam.frontend.measured import Measured
 from slam.frontend.network_motion import calibrate_network, network_steps
 from slam.frontend.visual.motion import Motion, Steps
-from slam.geometry.se3 import FloatArray, chain, equal_step, from_rotation_vector, invert, tangent
+from slam.geometry.robust import median
+from slam.geometry.se3 import (
+    FloatArray,
+    chain,
+    equal_step,
+    from_rotation_vector,
+    invert,
+    length_of,
+    tangent,
+)
 from slam.runtime.errors import SlamError
 
 INTERPOLATED_SOURCE = "interpolated"
@@ -81,7 +90,7 @@ def interpolate_gaps(
         over = range(*pose.ends)
         if len(over) > 1 and set(loose).issuperset(over):
             motion |= dict.fromkeys(over, equal_step(pose.T_from_to, len(over)))
-    typical = float(np.median([np.linalg.norm(T[:3, 3]) for T in known.values()]))
+    typical = median([np.linalg.norm(T[:3, 3]) for T in known.values()])
     return Filled(
         steps,
         _filled(measured.snippets, _completed(raw, range(count - 1)), count, sources),
@@ -99,7 +108,7 @@ def _is_trusted(snippet: SnippetPoses, frozen: Collection[int], cuts: Collection
 
 def _guess(k: int, T_k_next: FloatArray, typical: float) -> RelativePose:
     """An interpolated step, whose sigmas are wide: by its length, or by a ``typical`` one."""
-    length = max(float(np.linalg.norm(T_k_next[:3, 3])), typical, _SIGMA_FLOOR)
+    length = max(length_of(T_k_next[:3, 3]), typical, _SIGMA_FLOOR)
     sigmas = np.repeat([np.deg2rad(_ROTATION_SIGMA_DEG), _TRANSLATION_RELATIVE_SIGMA * length], 3)
     return RelativePose(k, k + 1, T_k_next, sigmas, INTERPOLATED_SOURCE)
 
@@ -126,7 +135,7 @@ def _without_frozen(
         following = next((k for k in range(last + 1, last + 2 + _LONGEST_DOUBT) if k in new), None)
         if not before or following is None:
             continue
-        expected = float(np.median([np.linalg.norm(T[:3, 3]) for T in before]))
+        expected = median([np.linalg.norm(T[:3, 3]) for T in before])
         jump = steps.get((last, following))
         repeats, onward = last - first + 1, following - last
         halfway = (onward + repeats / 2) * expected

@@ -19,7 +19,7 @@ from slam.frontend import agreement
 from slam.frontend.agreement import Agreement
 from slam.frontend.scale import MIN_FRAMES, ScaleEstimate
 from slam.geometry import se3
-from slam.geometry.robust import mad_sigma
+from slam.geometry.robust import mad_sigma, median
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import Failed, SlamError
 
@@ -79,7 +79,7 @@ class GpsFixes:
         own = np.array([config.sigma_m, config.sigma_m, up])
         self.sigmas: FloatArray = own * track.dilution[inside][:, None]
         self.widening = float(
-            np.sqrt(max(config.correlation_s / float(np.median(np.diff(self.stamps))), 1.0))
+            np.sqrt(max(config.correlation_s / median(np.diff(self.stamps)), 1.0))
         )
         self.agreement: Agreement | None = None
         self._frame_stamps = frame_stamps
@@ -96,7 +96,7 @@ class GpsFixes:
         if (found := self._by_speeds(T_world_camera_unscaled)) is not None:
             return found
         estimated = self._camera(T_world_camera_unscaled)
-        sigma = float(np.median(self.sigmas[:, 0]))
+        sigma = median(self.sigmas[:, 0])
         least = _LEAST_MOTION_SIGMAS * sigma
 
         def chords(span: int) -> tuple[FloatArray, FloatArray]:
@@ -107,7 +107,7 @@ class GpsFixes:
 
         tenth = max(len(estimated) // _CHORDS, 1)
         spans = range(tenth, max(len(estimated) // 2, tenth) + 1, tenth)
-        longest = max(spans, key=lambda span: float(np.median(chords(span)[1])))
+        longest = max(spans, key=lambda span: median(chords(span)[1]))
         by_gps, by_camera = chords(longest)
         metres = by_gps.sum() / max(by_camera.sum(), np.finfo(float).tiny)
         lengths = metres * chords(tenth)[1]
@@ -145,7 +145,7 @@ class GpsFixes:
         camera = self._camera(T_world_camera)
         sigma = self.sigmas * self.widening
         extent = float(np.ptp(self.points[:, :2], axis=0).max())
-        least = _LEAST_MOTION_SIGMAS * float(np.median(sigma[:, 0]))
+        least = _LEAST_MOTION_SIGMAS * median(sigma[:, 0])
         if extent < least:
             return Failed(
                 f"the camera moves too little for GPS to tell its heading: {extent:.1f} m, and {least:.1f} m are "
@@ -206,11 +206,7 @@ class GpsFixes:
 
     def _camera(self, T_any_camera: FloatArray) -> FloatArray:
         """Positions of the camera ``(M, 3)`` at the fixes, from its poses ``(N, 4, 4)``."""
-        ways = (
-            np.interp(self.stamps, self._frame_stamps, T_any_camera[:, axis, 3])
-            for axis in range(3)
-        )
-        return np.column_stack(list(ways))
+        return se3.interpolated(self.stamps, self._frame_stamps, T_any_camera[:, :3, 3])
 
 
 @dataclass(frozen=True)
@@ -262,7 +258,7 @@ class LocalFrame:
 
 def _usual(ratios: FloatArray) -> ScaleEstimate:
     """The median of lengths by GPS over those by the camera ``(M,)``."""
-    value = float(np.median(ratios))
+    value = median(ratios)
     return ScaleEstimate(value, mad_sigma(np.log(ratios / value)), len(ratios))
 
 

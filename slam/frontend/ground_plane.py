@@ -8,11 +8,10 @@ a fit to points.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Intrinsics
 from slam.frontend.visual.depth_error import DepthError
-from slam.geometry.se3 import FloatArray
+from slam.geometry.se3 import BoolArray, FloatArray, length_of
 from slam.runtime.errors import Failed
 
 _POINTS = 1500  # approximate number of pixels
@@ -75,7 +74,7 @@ class GroundPlaneFitter:
         if scaled_normal is None:
             return Failed(f"no plane within {_MAX_TILT_DEG:g} deg of level in front of the car")
         scaled_normal = _reweighted(rays, inverse_depth, scaled_normal)
-        height = 1.0 / float(np.linalg.norm(scaled_normal))
+        height = 1.0 / length_of(scaled_normal)
         inlier_ratio = float(_inliers(rays, inverse_depth, scaled_normal[None])[0].mean())
         if scaled_normal[1] * height < np.cos(np.deg2rad(_MAX_TILT_DEG)):
             return Failed(
@@ -107,7 +106,7 @@ def _ransac(rays: FloatArray, inverse_depth: FloatArray, seed: int) -> FloatArra
     return best
 
 
-def _inliers(rays: FloatArray, inverse_depth: FloatArray, planes: FloatArray) -> NDArray[np.bool_]:
+def _inliers(rays: FloatArray, inverse_depth: FloatArray, planes: FloatArray) -> BoolArray:
     """Inliers ``(S, P)`` of planes ``n / h`` ``(S, 3)`` by the relative error of depth."""
     over_measured = (rays / inverse_depth[:, None]).T.astype(np.float32)
     relative = planes.astype(np.float32) @ over_measured

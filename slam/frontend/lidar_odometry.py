@@ -8,12 +8,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from erfsfm.common.errors import ErfsfmError
 from erfsfm.common.progress import Progress, silent
 from slam.frames import RelativePose, Sequence
-from slam.geometry.se3 import FloatArray, invert
+from slam.geometry.se3 import FloatArray, IntArray, invert
 from slam.runtime.errors import Failed, SlamError
 
 logger = logging.getLogger(__name__)
@@ -31,7 +30,7 @@ class LidarPath:
     ``unreadable`` says of frames why their scan could not be read; they are left out.
     """
 
-    frames: NDArray[np.int64]
+    frames: IntArray
     T_world_camera: FloatArray
     unreadable: Mapping[int, str] = field(default_factory=dict)
 

@@ -14,7 +14,7 @@ from functools import reduce
 import numpy as np
 
 from slam.frames import RelativePose, SnippetPoses
-from slam.geometry.robust import MAD_TO_SIGMA, running_median
+from slam.geometry.robust import MAD_TO_SIGMA, median, running_median
 from slam.geometry.se3 import FloatArray, chain, invert, rigid, tangent
 
 NETWORK_SOURCE = "network"
@@ -117,7 +117,7 @@ def calibrate_network(
     used = (ratio > 0) & (length > _SHORTEST_PAIR * np.median(length / frames) * frames)
     if used.sum() < LEAST_PAIRS:
         return by_depth
-    unit = 1.0 / float(np.median(ratio[used]))
+    unit = 1.0 / median(ratio[used])
     t_network *= unit
     reach = np.where(np.arange(6) < 3, frames[:, None], length[:, None])
     error = np.abs(tangent(invert(T_network[used]) @ T_geometric[used])) / reach[used]

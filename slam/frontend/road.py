@@ -23,8 +23,16 @@ from numpy.typing import NDArray
 
 from slam.frames import Ends, Frame, Intrinsics, Mask, resized_mask, slopes_of
 from slam.frontend.visual.motion import Steps, links, triangulated
-from slam.geometry.robust import mad_sigma, running_median
-from slam.geometry.se3 import FloatArray, chain, invert, path_distance
+from slam.geometry.robust import mad_sigma, median, running_median
+from slam.geometry.se3 import (
+    FloatArray,
+    IntArray,
+    chain,
+    interpolated,
+    invert,
+    length_of,
+    path_distance,
+)
 from slam.runtime.errors import Failed
 
 _LEVEL = np.array([0.0, 1.0, 0.0])
@@ -72,7 +80,7 @@ class RoadStep:
     @property
     def length_heights(self) -> float:
         """Length of the step, in camera heights."""
-        return float(np.linalg.norm(self.plane))
+        return length_of(self.plane)
 
     def along(self, direction: FloatArray) -> RoadStep:
         """The same where a car goes in a ``direction`` ``(3,)`` of the later camera, parallel to its road."""
@@ -113,12 +121,11 @@ class RoadHomography:
         # of a level camera, pitched so that the motion is parallel to the road: the images alone
         # tell pitch poorly
         expected = _normal_along(np.median(self._directions, axis=0))
-        long, near = self._strips
-        measured = self._measured_on(long, previous, current, T_unit, expected)
-        if isinstance(measured, RoadStep):
-            return measured
-        nearby = self._measured_on(near, previous, current, T_unit, expected)
-        return nearby if isinstance(nearby, RoadStep) else measured
+        for strip in self._strips:
+            measured = self._measured_on(strip, previous, current, T_unit, expected)
+            if isinstance(measured, RoadStep):
+                break
+        return measured
 
     def _visible(self, fixed: Mask | None) -> list[_Strip]:
         camera = self._intrinsics
@@ -149,7 +156,7 @@ class RoadHomography:
         fine_before = strip.local(before[1][strip.rows, strip.columns, 0])
         fine_now = strip.local(now[1][strip.rows, strip.columns, 0])
         standing = _correlation(fine_before, fine_now)
-        length = max(float(np.linalg.norm(plane)), 1e-9)
+        length = max(length_of(plane), 1e-9)
         deviation = float(np.arccos(np.clip(plane / length @ expected, -1.0, 1.0)))
         if not np.isfinite(length) or deviation > np.deg2rad(_MAX_TILT_DEG):
             return Failed(f"the road would be tilted by {np.rad2deg(deviation):.0f} deg")
@@ -227,7 +234,7 @@ class RoadHomography:
             weighted = strip.rays * (slope * trust / (1.0 + (residual / (2.0 * sigma)) ** 2))
             information = ((weighted * slope) @ strip.rays.T).astype(np.float64)
             right = information @ plane - weighted @ residual
-            last, plane = plane, _solved(information, right, expected, float(np.linalg.norm(plane)))
+            last, plane = plane, _solved(information, right, expected, length_of(plane))
             if np.abs(plane - last).max() < _CONVERGED * np.linalg.norm(plane):
                 break
         correlation = _correlation(strip.local(grey), strip.local(seen))
@@ -249,7 +256,7 @@ def with_slope(road_steps: Mapping[Ends, RoadStep], steps: Steps) -> dict[Ends, 
     ratios = [
         motion.length_unscaled / road_steps[ends].length_heights for ends, motion in motions.items()
     ]
-    by_path = _path_directions(steps, _REACH_HEIGHTS * float(np.median(ratios)))
+    by_path = _path_directions(steps, _REACH_HEIGHTS * median(ratios))
     T_current_previous = invert(
         np.array([motion.relative_pose.T_from_to for motion in motions.values()])
     )
@@ -278,8 +285,8 @@ def _path_directions(steps: Steps, reach: float) -> dict[int, FloatArray]:
         run = list(consecutive)
         T = chain(np.array([steps[ends].relative_pose.T_from_to for ends in run]))
         places = path_distance(T)
-        behind = _interpolated(places - reach, places, T[:, :3, 3])
-        ahead = _interpolated(places + reach, places, T[:, :3, 3])
+        behind = interpolated(places - reach, places, T[:, :3, 3])
+        ahead = interpolated(places + reach, places, T[:, :3, 3])
         chords = np.einsum("nba,nb->na", T[:, :3, :3], ahead - behind)
         seen_from = [run[0][0], *(last for _, last in run)]
         lengths = np.linalg.norm(chords, axis=1)
@@ -287,11 +294,6 @@ def _path_directions(steps: Steps, reach: float) -> dict[int, FloatArray]:
             if length > reach:
                 found[frame] = chord / length
     return found
-
-
-def _interpolated(at: FloatArray, places: FloatArray, centres: FloatArray) -> FloatArray:
-    """Centres ``(M, 3)`` at places ``(M,)`` along a path, of ``(N, 3)`` at places ``(N,)``."""
-    return np.column_stack([np.interp(at, places, axis) for axis in centres.T])
 
 
 @dataclass(frozen=True)
@@ -306,10 +308,10 @@ class _Strip:
 
     relative_sigma: float
     hidden: float
-    rows: NDArray[np.int64]
-    columns: NDArray[np.int64]
+    rows: IntArray
+    columns: IntArray
     rays: _Layer
-    places: tuple[NDArray[np.int64], NDArray[np.int64]]
+    places: tuple[IntArray, IntArray]
     coverage: NDArray[np.float32]
     gradual: float
 
@@ -357,7 +359,7 @@ def _strip(
 
 def _normal_along(direction: FloatArray) -> FloatArray:
     """The normal ``(3,)`` of a road, down, unit, that is level across a ``direction`` ``(3,)`` and parallel to it."""
-    along = direction / max(float(np.linalg.norm(direction)), 1e-9)
+    along = direction / max(length_of(direction), 1e-9)
     normal = _LEVEL - (_LEVEL @ along) * along
     return normal / np.linalg.norm(normal)
 

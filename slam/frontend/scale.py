@@ -23,7 +23,6 @@ from itertools import compress
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
 from slam.config.sections import ScaleMode
@@ -31,8 +30,8 @@ from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.road import RoadStep
 from slam.frontend.visual.motion import Motion, links
-from slam.geometry.robust import difference_equations, mad_sigma, median, running_median
-from slam.geometry.se3 import FloatArray
+from slam.geometry.robust import difference_equations, mad_sigma, median, rms, running_median
+from slam.geometry.se3 import BoolArray, FloatArray, length_of
 from slam.runtime.errors import Failed
 
 LengthUnit = Literal["metres", "camera heights", "no metric unit", "the networks' own unit"]
@@ -153,7 +152,7 @@ class Scale:
             logger.warning("no scale (%s): lengths stay in %s", other.reason, self.unit)
             return replace(self, estimate=other)
         per_frame = other.value * self.per_frame
-        estimate = replace(other, value=float(np.median(per_frame)))
+        estimate = replace(other, value=median(per_frame))
         lengths = {
             ends: length._replace(value=other.value * length.value)
             for ends, length in self.lengths.items()
@@ -186,7 +185,7 @@ def find_scale(unit: Unit, drive: Drive, lidar_steps: Sequence[RelativePose] = (
     if isinstance(by_planes, Failed):
         both = motions.keys() & absolute.keys()
         ratios = [absolute[ends][0] / motions[ends].length_unscaled for ends in both]
-        prior_unit = float(np.median(ratios)) if ratios else 1.0
+        prior_unit = median(ratios) if ratios else 1.0
     else:
         prior_unit = by_planes.value
     evidence = gather_evidence(steps, drive.steps, absolute, prior_unit)
@@ -212,7 +211,7 @@ def find_scale(unit: Unit, drive: Drive, lidar_steps: Sequence[RelativePose] = (
     named: LengthUnit = "metres" if is_metric else "camera heights"
     if used >= MIN_FRAMES:
         spread = mad_sigma(misfit[np.isfinite(misfit)])
-        estimate = ScaleEstimate(float(np.median(per_frame)), spread, used)
+        estimate = ScaleEstimate(median(per_frame), spread, used)
     elif isinstance(by_planes, Failed):
         named = "the networks' own unit"
         logger.warning("no scale (%s): lengths stay in %s", by_planes.reason, named)
@@ -235,7 +234,7 @@ def _absolute_lengths(
         ends: (unit * road.length_heights, road.relative_sigma) for ends, road in road_steps.items()
     }
     for pose in lidar_steps:
-        length = float(np.linalg.norm(pose.T_from_to[:3, 3]))
+        length = length_of(pose.T_from_to[:3, 3])
         if length > 0:
             absolute[pose.ends] = length, float(pose.sigmas[3]) / length
     return absolute
@@ -243,7 +242,7 @@ def _absolute_lengths(
 
 def height_by_lidar(lidar_steps: Sequence[RelativePose], drive: Drive) -> float | None:
     """The camera's height from steps measured by LiDAR and the road, or else by learned planes; None without both."""
-    metres = {pose.ends: float(np.linalg.norm(pose.T_from_to[:3, 3])) for pose in lidar_steps}
+    metres = {pose.ends: length_of(pose.T_from_to[:3, 3]) for pose in lidar_steps}
     roads = drive.road_steps
     heights = [metres[ends] / roads[ends].length_heights for ends in roads if ends in metres]
     if not heights:
@@ -253,7 +252,7 @@ def height_by_lidar(lidar_steps: Sequence[RelativePose], drive: Drive) -> float 
             plane = drive.measured.roads[ends[0]]
             if not isinstance(plane, Failed):
                 heights.append(metres[ends] / motion.length_unscaled * plane)
-    return float(np.median(heights)) if heights else None
+    return median(heights) if heights else None
 
 
 def scale_from_road(roads: Sequence[float | Failed], height: float = 1.0) -> ScaleEstimate | Failed:
@@ -309,7 +308,7 @@ class StepEvidence:
         over_steps = (summed[_NOISE_STEPS:] - summed[:-_NOISE_STEPS])[whole]
         if len(over_steps) < _NOISE_STEPS:
             return 1.0
-        return max(float(np.sqrt(np.mean(over_steps**2))) / _USUAL_NOISE, 1.0)
+        return max(rms(over_steps) / _USUAL_NOISE, 1.0)
 
     def steady_sigma(self, log_length: FloatArray, camera_height: float) -> FloatArray:
         """By how much a vehicle's acceleration changes the logarithm of its speed from step to step ``(S - 1,)``.
@@ -327,7 +326,7 @@ class StepEvidence:
 
     def contradicted(
         self, log_length: FloatArray, log_unit: FloatArray, speed_sigma: FloatArray
-    ) -> NDArray[np.bool_]:
+    ) -> BoolArray:
         """Which lengths are not what learned depth says, or change as no vehicle's does ``(S,)``.
 
         Args:
@@ -364,7 +363,7 @@ class StepLengths:
     relative_sigma: FloatArray
     relative_correlated_sigma: FloatArray
     unit_correction: FloatArray
-    contradicted: NDArray[np.bool_]
+    contradicted: BoolArray
 
 
 def gather_evidence(

@@ -16,7 +16,7 @@ from slam.frames import Ends
 from slam.frontend.gps import GpsFixes
 from slam.frontend.lidar_odometry import has_scans
 from slam.frontend.scale import ScaleEstimate, Unit
-from slam.geometry.se3 import FloatArray, path_distance
+from slam.geometry.se3 import FloatArray, length_of, path_distance
 from slam.runtime.errors import Failed, SlamError
 
 _REFERENCE_FRAMES = 50  # number of first frames that mode reference compares
@@ -130,7 +130,7 @@ def scale_from_distance(
 ) -> ScaleEstimate | Failed:
     """The known distance of two frames, metres, over their estimated distance."""
     first, second = T_world_camera_unscaled[[*ends], :3, 3]
-    apart = float(np.linalg.norm(second - first))
+    apart = length_of(second - first)
     if not apart > 0:
         return Failed(f"the camera does not move between frames {ends[0]} and {ends[1]}")
     return ScaleEstimate(known_m / apart, 0.0, 2)

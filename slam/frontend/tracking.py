@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Frame, Grey, Intrinsics, resized_mask
 from slam.geometry.multiview import UnitRelativePose
-from slam.geometry.se3 import FloatArray, invert
+from slam.geometry.se3 import BoolArray, FloatArray, IntArray, invert
 
 Pixels = NDArray[np.float32]
 _TERMINATION = cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT
@@ -32,14 +32,14 @@ _INVERSIONS = 2
 _DEPTH_WIDTH_PX = 400
 MAX_CORNERS = 800  # of a step: twice as many change no error and take twice the time
 _GRID_PX = 3  # the flow is computed at every third pixel: learned depth has no finer detail
-# displacements that remain after the predicted flow are small
-_PREDICTED_LEVELS = 2
 _ACROSS_PX = 1.0  # largest error of a corner over several steps, by the way across and step by step
 # steps between frames whose rotation is also measured directly: halves its error
 ROTATION_BASELINE = 2
 LONGEST_STEP = 30  # frames across which corners are compared where nothing can be told apart
 # tracks below which they are sought again, with the wide window and equal exposure
 FEW_CORNERS = 60
+# no corners, and the identifiers of their tracks
+_NOTHING = np.zeros((0, 2), np.float32), np.zeros(0, np.int64)
 _WIDE_WINDOW_PX = 31  # side of the window after most tracks were lost, pixels
 
 
@@ -73,7 +73,11 @@ class Texture(NamedTuple):
     block_px: int
 
 
-STEP_SEARCH = Search(side=11, levels=4, limits=(30, 0.01), back=None, error_px=0.5, norm=np.inf)
+# the second is for displacements that remain after the predicted flow, which are small
+STEP_SEARCH, _PREDICTED_SEARCH = (
+    Search(side=11, levels=levels, limits=(30, 0.01), back=None, error_px=0.5, norm=np.inf)
+    for levels in (4, 2)
+)
 # OpenCV computes eight columns of a window at once and those that remain one by one: 16 take half
 # the time of 15
 KEYFRAME_SEARCH = Search(
@@ -85,7 +89,7 @@ KEYFRAME_CORNERS = Texture(quality=0.0003, spacing_px=12.0, block_px=3)
 
 def track(
     first: Grey, second: Grey, pixels: Pixels, search: Search, guesses: Pixels | None = None
-) -> tuple[Pixels, NDArray[np.bool_]]:
+) -> tuple[Pixels, BoolArray]:
     """Pixels ``(M, 2)`` of the first image found in the second, and which of them were found back ``(M,)``.
 
     Args:
@@ -96,28 +100,18 @@ def track(
         guesses: where the search begins ``(M, 2)``; None is at the pixels themselves.
     """
     guesses = pixels if guesses is None else guesses
-    moved, forward = _lucas_kanade(
-        first, second, pixels, guesses, search.side, search.levels, search.limits, search.texture
-    )
+    moved, forward = _lucas_kanade(first, second, pixels, guesses, search)
     levels, limits = search.back or (search.levels, search.limits)
     start = moved if search.back is None else pixels
-    returned, backward = _lucas_kanade(
-        second, first, moved, start, search.side, levels, limits, search.texture
-    )
+    back = search._replace(levels=levels, limits=limits)
+    returned, backward = _lucas_kanade(second, first, moved, start, back)
     near = np.linalg.norm(returned - pixels, search.norm, axis=1) < search.error_px
     return moved, forward & backward & near
 
 
 def _lucas_kanade(
-    first: Grey,
-    second: Grey,
-    pixels: Pixels,
-    guesses: Pixels,
-    side: int,
-    levels: int,
-    limits: tuple[int, float],
-    texture: float = _LEAST_TEXTURE,
-) -> tuple[Pixels, NDArray[np.bool_]]:
+    first: Grey, second: Grey, pixels: Pixels, guesses: Pixels, search: Search
+) -> tuple[Pixels, BoolArray]:
     if not len(pixels):
         return pixels, np.zeros(0, np.bool_)
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
@@ -125,16 +119,16 @@ def _lucas_kanade(
         second,
         pixels.reshape(-1, 1, 2),
         guesses.reshape(-1, 1, 2).copy(),
-        winSize=(side, side),
-        maxLevel=levels,
-        criteria=(_TERMINATION, *limits),
+        winSize=(search.side, search.side),
+        maxLevel=search.levels,
+        criteria=(_TERMINATION, *search.limits),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        minEigThreshold=texture,
+        minEigThreshold=search.texture,
     )
     return moved.reshape(-1, 2), status.ravel().astype(bool)
 
 
-def are_inside(pixels: Pixels, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def are_inside(pixels: Pixels, shape: tuple[int, ...]) -> BoolArray:
     """Which pixels ``(M, 2)`` lie in an image ``(H, W)``."""
     return np.asarray(
         (pixels >= 0).all(axis=1) & (pixels <= [shape[1] - 1, shape[0] - 1]).all(axis=1)
@@ -156,12 +150,12 @@ def new_corners(
         texture: what a corner is.
     """
     if count <= 0:
-        return np.zeros((0, 2), np.float32)
+        return _NOTHING[0]
     grey = frame.grey
     free = _away_from(taken, int(texture.spacing_px), grey.shape)
     if frame.fixed is not None:
         free[resized_mask(frame.fixed, *grey.shape[::-1])] = 0
-    tiles, ranks = [np.zeros((0, 2), np.float32)], [np.zeros(0, np.int64)]
+    tiles, ranks = [_NOTHING[0]], [_NOTHING[1]]
     for top, bottom in pairwise(np.linspace(0, grey.shape[0], _TILES[0] + 1).astype(int)):
         for left, right in pairwise(np.linspace(0, grey.shape[1], _TILES[1] + 1).astype(int)):
             tile, mask = (
@@ -207,8 +201,14 @@ class Tracks:
 
     previous: FloatArray
     current: FloatArray
-    track_ids: NDArray[np.int64]
+    track_ids: IntArray
     sought: int
+
+    @classmethod
+    def of(cls, before: Pixels, now: Pixels, track_ids: IntArray, kept: BoolArray) -> Self:
+        """Those ``kept`` ``(M,)`` of corners ``(M, 2)`` that were sought."""
+        before_kept, now_kept = (pixels[kept].astype(np.float64) for pixels in (before, now))
+        return cls(before_kept, now_kept, track_ids[kept], len(kept))
 
     def __len__(self) -> int:
         return len(self.track_ids)
@@ -219,7 +219,7 @@ class CornerTracker:
 
     def __init__(self) -> None:
         # of the last frames: pixels (M, 2) and the identifiers of their tracks (M,)
-        self._corners: dict[int, tuple[Pixels, NDArray[np.int64]]] = {}
+        self._corners: dict[int, tuple[Pixels, IntArray]] = {}
         self._next_track_id = 0
 
     def track(
@@ -233,14 +233,13 @@ class CornerTracker:
             predicted_flow: between them; None where nothing predicts it.
         """
         if previous.index not in self._corners:
-            self._fill(previous, np.zeros((0, 2), np.float32), np.zeros(0, np.int64))
+            self._fill(previous, *_NOTHING)
         pixels, track_ids = self._corners[previous.index]
         forward, kept = _tracked(previous.grey, current.grey, pixels, predicted_flow)
         kept &= ~current.is_fixed(forward)
         if current.index not in self._corners:
             self._fill(current, forward[kept], track_ids[kept])
-        before, now = pixels[kept].astype(np.float64), forward[kept].astype(np.float64)
-        return Tracks(before, now, track_ids[kept], len(kept))
+        return Tracks.of(pixels, forward, track_ids, kept)
 
     def track_across(
         self, previous: Frame, current: Frame, predicted_flow: PredictedFlow
@@ -250,29 +249,22 @@ class CornerTracker:
         The function returned does it, in any thread. It keeps corners that both ways find at the
         same place, which is half the work of tracking them back.
         """
-        nothing: tuple[Pixels, NDArray[np.int64]] = (
-            np.zeros((0, 2), np.float32),
-            np.zeros(0, np.int64),
-        )
         corners, arrived = (
-            self._corners.get(frame.index, nothing) for frame in (previous, current)
+            self._corners.get(frame.index, _NOTHING) for frame in (previous, current)
         )
         track_ids, rows, rows_arrived = np.intersect1d(corners[1], arrived[1], return_indices=True)
         points, by_steps = corners[0][rows], arrived[0][rows_arrived]
 
         def find() -> Tracks:
             images = previous.grey, predicted_flow.warp_back(current.grey)
-            pixels, kept = _lucas_kanade(
-                *images, points, points, STEP_SEARCH.side, _PREDICTED_LEVELS, STEP_SEARCH.limits
-            )
+            pixels, kept = _lucas_kanade(*images, points, points, _PREDICTED_SEARCH)
             pixels = predicted_flow.in_current(pixels)
             kept &= np.linalg.norm(pixels - by_steps, STEP_SEARCH.norm, axis=1) < _ACROSS_PX
-            before, now = points[kept].astype(np.float64), pixels[kept].astype(np.float64)
-            return Tracks(before, now, track_ids[kept], len(kept))
+            return Tracks.of(points, pixels, track_ids, kept)
 
         return find
 
-    def _fill(self, frame: Frame, pixels: Pixels, track_ids: NDArray[np.int64]) -> None:
+    def _fill(self, frame: Frame, pixels: Pixels, track_ids: IntArray) -> None:
         """Keep the corners tracked to a frame, and new ones up to the largest number."""
         fresh = new_corners(frame, pixels, MAX_CORNERS - len(pixels), STEP_CORNERS)
         new_ids = self._next_track_id + np.arange(len(fresh))
@@ -287,7 +279,7 @@ class CornerTracker:
 
 def _tracked(
     first: Grey, second: Grey, points: Pixels, predicted_flow: PredictedFlow | None
-) -> tuple[Pixels, NDArray[np.bool_]]:
+) -> tuple[Pixels, BoolArray]:
     """Points ``(M, 2)`` tracked to the second image, and which are reliable ``(M,)``; with wide windows if few."""
     flows = [predicted_flow, None] if predicted_flow else [None]
     pixels, kept = _by_first_flow(first, second, points, flows)
@@ -311,16 +303,14 @@ def _by_first_flow(
     points: Pixels,
     flows: Sequence[PredictedFlow | None],
     side: int = STEP_SEARCH.side,
-) -> tuple[Pixels, NDArray[np.bool_]]:
+) -> tuple[Pixels, BoolArray]:
     """Points ``(M, 2)`` by the first predicted flow, or by none, with which they are found back; which are ``(M,)``."""
     pixels, kept = points.copy(), np.zeros(len(points), dtype=bool)
     for flow in flows:
         tried = np.flatnonzero(~kept)
-        levels = STEP_SEARCH.levels if flow is None else _PREDICTED_LEVELS
+        search = STEP_SEARCH if flow is None else _PREDICTED_SEARCH
         image = second if flow is None else flow.warp_back(second)
-        moved, found_back = track(
-            first, image, points[tried], STEP_SEARCH._replace(side=side, levels=levels)
-        )
+        moved, found_back = track(first, image, points[tried], search._replace(side=side))
         moved = moved[found_back]
         pixels[tried[found_back]], kept[tried[found_back]] = (
             moved if flow is None else flow.in_current(moved),

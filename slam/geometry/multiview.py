@@ -17,7 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry.robust import mad_sigma, median
-from slam.geometry.se3 import FloatArray, apply, compose, make, nearest_rotation, rotation_matrix
+from slam.geometry.se3 import (
+    BoolArray,
+    FloatArray,
+    apply,
+    compose,
+    length_of,
+    make,
+    nearest_rotation,
+    rotation_matrix,
+)
 
 LEAST_DEPTH = 1e-6
 MIN_POINTS = 20  # least number of points that give a camera its pose
@@ -110,7 +119,7 @@ def resect(
     K: FloatArray,
     seed: int = 0,
     spread: FloatArray | None = None,
-    trusted: NDArray[np.bool_] | None = None,
+    trusted: BoolArray | None = None,
 ) -> Resection:
     """The pose found from the first guess ``T_camera_world``; in doubt that with most inliers, from others too.
 
@@ -138,7 +147,7 @@ def resect(
     return best
 
 
-def _support(pose: Resection, votes: NDArray[np.bool_]) -> int:
+def _support(pose: Resection, votes: BoolArray) -> int:
     return int((pose.residual_px[votes] < INLIER_PX).sum())
 
 
@@ -149,7 +158,7 @@ def _best(
     K: FloatArray,
     seed: int,
     spread: FloatArray | None,
-    votes: NDArray[np.bool_],
+    votes: BoolArray,
 ) -> Resection:
     """The pose by the points that vote ``(M,)``."""
 
@@ -178,7 +187,7 @@ def _refined(
     spread: FloatArray | None,
     pixels: FloatArray,
     K: FloatArray,
-    votes: NDArray[np.bool_],
+    votes: BoolArray,
 ) -> Resection:
     """Cauchy weights of half an inlier; far from the solution, where all residuals are large, of their median."""
     T = T_camera_world.copy()
@@ -249,7 +258,7 @@ class UnitRelativePose:
     @classmethod
     def of(cls, T_current_previous: FloatArray) -> tuple[Self, float] | None:
         """That of a transform, and its length; None where it has none."""
-        length = float(np.linalg.norm(T_current_previous[:3, 3]))
+        length = length_of(T_current_previous[:3, 3])
         return (
             (cls(T_current_previous[:3, :3], T_current_previous[:3, 3] / length), length)
             if length > 0

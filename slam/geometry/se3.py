@@ -7,13 +7,16 @@ Functions accept stacks: any leading shape before ``(4, 4)``.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
 
 def make(R_a_b: FloatArray, t_a_b: FloatArray) -> FloatArray:
@@ -35,6 +38,11 @@ def apply(T_a_b: FloatArray, points_b: FloatArray) -> FloatArray:
     """Points ``(N, 3)`` in b, moved to a by one ``(4, 4)`` transform."""
     points_a: FloatArray = points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
     return points_a
+
+
+def length_of(vector: ArrayLike) -> float:
+    """Euclidean length of a vector ``(D,)``."""
+    return float(np.linalg.norm(vector))
 
 
 def rotation_angle(R: FloatArray) -> FloatArray:
@@ -76,8 +84,12 @@ def interpolate(T_world_camera: FloatArray, known: FloatArray, stamps: FloatArra
     """Poses ``(N, 4, 4)`` at ``stamps`` ``(N,)`` from poses ``(M, 4, 4)`` at ``known`` ``(M,)``; ends are held."""
     times = np.clip(stamps, known[0], known[-1])
     R = Slerp(known, Rotation.from_matrix(T_world_camera[:, :3, :3]))(times).as_matrix()
-    t = np.column_stack([np.interp(times, known, T_world_camera[:, axis, 3]) for axis in range(3)])
-    return make(R, t)
+    return make(R, interpolated(times, known, T_world_camera[:, :3, 3]))
+
+
+def interpolated(at: FloatArray, known: NDArray[Any], points: FloatArray) -> FloatArray:
+    """Points ``(M, D)`` at places or times ``(M,)`` on the path through points ``(N, D)`` at known ones ``(N,)``."""
+    return np.stack([np.interp(at, known, axis) for axis in points.T], axis=-1)
 
 
 def path_distance(T_world_camera: FloatArray) -> FloatArray:

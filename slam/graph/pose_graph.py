@@ -26,7 +26,8 @@ from scipy.spatial.transform import Rotation
 
 from slam.formats.trajectory import translations_and_quaternions
 from slam.frames import LOOP_SOURCE, RelativePose
-from slam.geometry.se3 import FloatArray, invert, is_se3, make, path_distance
+from slam.geometry.robust import median
+from slam.geometry.se3 import BoolArray, FloatArray, invert, is_se3, make, path_distance
 from slam.runtime.errors import SlamError
 from slam.runtime.files import write_atomically
 
@@ -39,8 +40,8 @@ HUBER_K = 1.345
 _LARGEST_RESIDUAL = 8.0  # whitened, of a loop or position that is removed
 _OUTLYING = 3.0  # its residual over the median of its kind
 _MAX_ITERATIONS = 100  # of Levenberg-Marquardt
-_MAX_DROPPED_LOOPS = 10  # largest number of loops removed where the system is singular
-_RELATIVE_TOLERANCE = 1e-6  # relative decrease of the error below which it ends
+# relative decrease of the error below which it ends, of a pose graph and of the units of maps
+_RELATIVE_TOLERANCE, _RELATIVE_TOLERANCE_OF_MAPS = 1e-6, 1e-5
 # g2o's text format
 _TRANSLATION_FIRST = [3, 4, 5, 0, 1, 2]
 _UPPER = np.triu_indices(6)  # row by row
@@ -54,8 +55,7 @@ class PoseGraph:
 
     Attributes:
         relative_poses: the factors in use, in the order they were added.
-        dropped: loop factors that were left out: the system was singular with them, or they
-            contradict the rest.
+        dropped: loop factors that were left out: they contradict the rest.
         T_fixed_world: ``(4, 4)``: the world in the axes of the measured positions; the identity
             without any.
     """
@@ -121,22 +121,22 @@ class PoseGraph:
             raise SlamError(
                 "the initial trajectory of the pose graph must be finite rigid transforms"
             )
-        for _ in range(_MAX_DROPPED_LOOPS + 1):
-            try:
-                self._T_world_camera = self._solve(T_world_camera_initial)
-                return self._T_world_camera.copy()
-            except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException among them
-                reason = str(error).strip().partition("\n")[0]
-                loops = np.flatnonzero(self._is_loop())
-                if not len(loops):
-                    raise SlamError(f"the pose graph cannot be solved: {reason}") from error
-                newest = self.relative_poses.pop(loops[-1])
-                self.dropped.append(newest)
-                logger.warning("loop %d -> %d dropped from the graph: %s", *newest.ends, reason)
-                _check_connected(self.relative_poses, len(T_world_camera_initial))
-        raise SlamError(
-            f"the pose graph cannot be solved even without {len(self.dropped)} loop edges"
+        values = self._values(T_world_camera_initial)
+        solved = _solved(
+            self._factors(values), values, _RELATIVE_TOLERANCE, "the pose graph cannot be solved"
         )
+        T_fixed_camera = np.stack(
+            [solved.atPose3(k).matrix() for k in range(len(T_world_camera_initial))]
+        )
+        if not np.isfinite(T_fixed_camera).all():
+            raise SlamError("the pose graph cannot be solved: the solution is not finite")
+        T_fixed_camera[:, :3, :3] = Rotation.from_matrix(T_fixed_camera[:, :3, :3]).as_matrix()
+        rebased: FloatArray = T_world_camera_initial[0] @ invert(T_fixed_camera[0]) @ T_fixed_camera
+        if self._positions:
+            self.T_fixed_world = T_fixed_camera[0] @ invert(T_world_camera_initial[0])
+        rebased[0] = T_world_camera_initial[0]
+        self._T_world_camera = rebased
+        return rebased.copy()
 
     def drop_contradicted(self) -> bool:
         """Drop loops and positions whose residual is large while that of most is small.
@@ -215,7 +215,7 @@ class PoseGraph:
             lines.append(f"{_EDGE} {ends} {_numbers(pose)} {_numbers(information)}")
         write_atomically(path, "\n".join([*lines, ""]))
 
-    def _is_loop(self) -> NDArray[np.bool_]:
+    def _is_loop(self) -> BoolArray:
         """Which of the factors ``(F,)`` are loops."""
         return np.array([edge.source == LOOP_SOURCE for edge in self.relative_poses], dtype=bool)
 
@@ -223,33 +223,6 @@ class PoseGraph:
         if self._T_world_camera is None:
             raise SlamError("the pose graph has not been optimised yet")
         return self._T_world_camera
-
-    def _solve(self, T_world_camera_initial: FloatArray) -> FloatArray:
-        values = self._values(T_world_camera_initial)
-        graph = self._factors(values)
-        parameters = gtsam.LevenbergMarquardtParams()
-        parameters.setMaxIterations(_MAX_ITERATIONS)
-        parameters.setRelativeErrorTol(_RELATIVE_TOLERANCE)
-        optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
-        solved = optimiser.optimize()
-        logger.info(
-            "pose graph: %d factors, error %.4g to %.4g in %d iterations",
-            len(self.relative_poses),
-            graph.error(values),
-            optimiser.error(),
-            optimiser.iterations(),
-        )
-        T_fixed_camera = np.stack(
-            [solved.atPose3(k).matrix() for k in range(len(T_world_camera_initial))]
-        )
-        if not np.isfinite(T_fixed_camera).all():
-            raise RuntimeError("the solution is not finite")
-        T_fixed_camera[:, :3, :3] = Rotation.from_matrix(T_fixed_camera[:, :3, :3]).as_matrix()
-        rebased: FloatArray = T_world_camera_initial[0] @ invert(T_fixed_camera[0]) @ T_fixed_camera
-        if self._positions:
-            self.T_fixed_world = T_fixed_camera[0] @ invert(T_world_camera_initial[0])
-        rebased[0] = T_world_camera_initial[0]
-        return rebased
 
     def _values(self, T_world_camera: FloatArray) -> Any:
         values = gtsam.Values()
@@ -290,9 +263,9 @@ def whitened_squared(
     return np.array(squared)
 
 
-def _outlying(squared: FloatArray) -> NDArray[np.bool_]:
+def _outlying(squared: FloatArray) -> BoolArray:
     """Which whitened squared residuals ``(F,)`` are large, and far above the median as well."""
-    typical = float(np.median(np.sqrt(squared))) if len(squared) else 0.0
+    typical = median(np.sqrt(squared)) if len(squared) else 0.0
     return squared > max(_LARGEST_RESIDUAL, _OUTLYING * typical) ** 2
 
 
@@ -346,17 +319,36 @@ def optimise_similarities(
         noise = robust_noise(np.concatenate([pose.sigmas[:3], pose.sigmas[3:] / ratio, [sigma]]))
         measured = _similarity(pose.T_from_to, ratio)
         graph.add(gtsam.BetweenFactorSimilarity3(*pose.ends, measured, noise))
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(_MAX_ITERATIONS)
-    try:
-        solved = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-    except RuntimeError as error:
-        reason = str(error).strip().partition("\n")[0]
-        raise SlamError(f"the maps cannot be joined: {reason}") from error
+    solved = _solved(graph, values, _RELATIVE_TOLERANCE_OF_MAPS, "the maps cannot be joined")
     found = [solved.atSimilarity3(k) for k in range(len(T_world_camera))]
     R = Rotation.from_matrix([each.rotation().matrix() for each in found]).as_matrix()
     scales = np.array([each.scale() for each in found])
     return make(R, scales[:, None] * np.array([each.translation() for each in found])), scales
+
+
+def _solved(graph: Any, values: Any, tolerance: float, failure: str) -> Any:
+    """The values that fit a graph best, from a start; ``failure`` begins the sentence of an error.
+
+    Raises:
+        SlamError: the system cannot be solved.
+    """
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(_MAX_ITERATIONS)
+    parameters.setRelativeErrorTol(tolerance)
+    try:
+        optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
+        solved = optimiser.optimize()
+    except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException among them
+        reason = str(error).strip().partition("\n")[0]
+        raise SlamError(f"{failure}: {reason}") from error
+    logger.info(
+        "graph: %d factors, error %.4g to %.4g in %d iterations",
+        graph.size(),
+        graph.error(values),
+        optimiser.error(),
+        optimiser.iterations(),
+    )
+    return solved
 
 
 def _similarity(T_a_b: FloatArray, scale: float) -> Any:

@@ -19,6 +19,7 @@ from erfsfm.mvs.refine import Decide, RefinedDepth, measure
 from erfsfm.mvs.views import Appearance, neighbours_around
 from slam.config.sections import MappingConfig
 from slam.frames import DepthMap, Image, Intrinsics, Mask
+from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray, invert
 
 # chosen on simulated streets and on drive 0013, see docs/design/map.md
@@ -101,7 +102,7 @@ class DepthFilters:
             ~self._is_sky(view.image) | is_exact,
             (depth >= config.depth_min_m) & (depth < farthest),
             ~(sigma > MOST_RELATIVE_SIGMA),  # where none is stated, too
-            ~_at_edges(self.trusted(view), _MAX_DEPTH_STEP) | is_exact,
+            ~_at_edges(self.trusted(view)) | is_exact,
             np.any([self._agrees(view, other) for other in others], axis=0)
             if others
             else everything,
@@ -173,7 +174,7 @@ def sampled(image: NDArray[Any], u: DepthMap, v: DepthMap) -> NDArray[Any]:
     return cv2.remap(image, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
 
 
-def _at_edges(depth: DepthMap, max_step: float) -> Mask:
+def _at_edges(depth: DepthMap) -> Mask:
     """Pixels on either side of a relative depth step, where networks blur depth."""
     edges = np.zeros(depth.shape, dtype=bool)
     for near, far in (
@@ -181,7 +182,7 @@ def _at_edges(depth: DepthMap, max_step: float) -> Mask:
         ((slice(1, None),), (slice(-1),)),
     ):
         a, b = depth[near], depth[far]
-        step = np.abs(a - b) > max_step * np.minimum(a, b)
+        step = np.abs(a - b) > _MAX_DEPTH_STEP * np.minimum(a, b)
         edges[near] |= step
         edges[far] |= step
     return edges
@@ -222,9 +223,7 @@ class DepthRefiner:
         unknown = ~(np.isfinite(depth) & (depth > 0))
         if unknown.all():
             return None
-        chosen = neighbours_around(
-            self._T_world_camera, n, float(np.median(depth[~unknown])), self._indices
-        )
+        chosen = neighbours_around(self._T_world_camera, n, median(depth[~unknown]), self._indices)
         if not chosen:
             return None
         if unknown.any():

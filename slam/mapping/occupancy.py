@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from slam.formats.ply import Ply
-from slam.geometry.se3 import FloatArray
+from slam.geometry.robust import median
+from slam.geometry.se3 import FloatArray, IntArray
 from slam.mapping.submap import moved_rows
 from slam.runtime.errors import RunError
 from slam.runtime.files import write_atomically
@@ -83,13 +84,13 @@ class Grid:
         """Smallest x and y ``(2,)``."""
         return (self.first * self.resolution).round(9)
 
-    def cells(self, points: FloatArray) -> NDArray[np.int64]:
+    def cells(self, points: FloatArray) -> IntArray:
         """Flat numbers ``(P,)`` of the cells of points ``(P, 2 or 3)``."""
         places = np.floor(points[:, :2] / self.resolution - self.first)
         column, row = np.clip(places, 0, [self.width - 1, self.height - 1]).astype(np.int64).T
         return row * self.width + column
 
-    def centres(self, cells: NDArray[np.int64]) -> FloatArray:
+    def centres(self, cells: IntArray) -> FloatArray:
         """Centres ``(C, 2)`` of cells by their flat numbers."""
         row, column = np.divmod(cells, self.width)
         return (self.first + 0.5 + np.stack([column, row], axis=1)) * self.resolution
@@ -187,12 +188,12 @@ def ground_along(
 
     limits = _NEAREST * camera_height, _FURTHEST * camera_height
     found = (depth[(depth > limits[0]) & (depth < limits[1])] for _, depth in around())
-    medians = [float(np.median(depth)) for depth in found if len(depth) >= _MIN_POINTS]
+    medians = [median(depth) for depth in found if len(depth) >= _MIN_POINTS]
     if not medians:
         raise RunError(
             "the map has no ground below the cameras, so free and occupied cannot be told apart"
         )
-    height = float(np.median(medians))
+    height = median(medians)
     planes = [
         _plane(
             near[np.abs(depth - height) < _BAND * height],

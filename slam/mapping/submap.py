@@ -18,7 +18,8 @@ from scipy.linalg import solveh_banded
 from scipy.spatial import cKDTree
 
 from slam.frames import DepthMap, Image, Intrinsics
-from slam.geometry.se3 import FloatArray, apply, invert, rotation_angle
+from slam.geometry.robust import difference_equations, median
+from slam.geometry.se3 import BoolArray, FloatArray, apply, invert, length_of, rotation_angle
 from slam.mapping.depth import DepthFilters, KeyframeDepth, sampled
 from slam.runtime.imports import import_open3d
 from slam.runtime.memory import SpilledArray
@@ -70,7 +71,7 @@ class Submap:
     brightness_steps: FloatArray
     camera: FloatArray
 
-    def blocks(self, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+    def blocks(self, chosen: BoolArray) -> tuple[BoolArray, NDArray[np.intp]]:
         """Observed voxels ``(C, 4096)`` of the chosen ``(B,)`` blocks, and their places in ``tsdf``, in order."""
         counts = np.bitwise_count(self.observed).sum(axis=1, dtype=np.int64)
         begins = np.cumsum(counts) - counts
@@ -120,9 +121,7 @@ class Fusion:
         how = (self._K, T_camera_world, 1.0, self._reach, TRUNCATION_VOXELS)
         self._grid.integrate(self._grid.compute_unique_block_coordinates(image, *how), image, *how)
         position = T_world_camera[:3, 3]
-        self.length += (
-            0.0 if self._position is None else float(np.linalg.norm(position - self._position))
-        )
+        self.length += 0.0 if self._position is None else length_of(position - self._position)
         self._position = position
         return True
 
@@ -300,7 +299,7 @@ def has_moved(
     """
     T_before_camera = invert(T_world_before) @ T_world_camera
     turned = float(rotation_angle(T_before_camera[:3, :3]))
-    return float(np.linalg.norm(T_before_camera[:3, 3])) >= step_m or turned >= np.deg2rad(turn_deg)
+    return length_of(T_before_camera[:3, 3]) >= step_m or turned >= np.deg2rad(turn_deg)
 
 
 def moved_rows(T_world_camera: FloatArray, step_m: float, turn_deg: float) -> list[int]:
@@ -331,7 +330,7 @@ class Painter:
         self._submaps, self._voxel, self._range = submaps, voxel_size_m, reach_m
         steps, outwards, slopes = submaps.brightness_steps.T
         known = slopes[np.isfinite(slopes)]
-        self._darkening = float(np.median(known)) if len(known) else 0.0
+        self._darkening = median(known) if len(known) else 0.0
         self._gains = np.exp(-evened(steps - self._darkening * outwards))
 
     def colours(self, points_world: FloatArray) -> NDArray[np.uint8]:
@@ -391,14 +390,13 @@ def evened(brightness_steps: FloatArray) -> FloatArray:
     if count < 2:
         return np.zeros(count)
     steps = brightness_steps[1:]
-    known = np.isfinite(steps)
-    steps = np.where(known, steps, 0.0)
-    banded, right = np.zeros((2, count)), np.zeros(count)
-    banded[1] = _EXPOSURE_PRIOR
-    banded[1, 1:] += known
-    banded[1, :-1] += known
-    banded[0, 1:] = -known.astype(float)
-    right[1:] += steps
-    right[:-1] -= steps
-    solved: FloatArray = solveh_banded(banded, right)
+    known, views = np.isfinite(steps), np.arange(count)
+    information, right = difference_equations(
+        views[1:],
+        views[:-1],
+        np.where(known, steps, 0.0),
+        known.astype(float),
+        np.full(count, _EXPOSURE_PRIOR),
+    )
+    solved: FloatArray = solveh_banded(information[1:], right)
     return solved

@@ -23,7 +23,7 @@ from erfsfm.common.progress import Progress, silent
 from slam.config.sections import MappingConfig
 from slam.formats.ply import Ply, write_ply_pieces
 from slam.frames import Mask
-from slam.geometry.se3 import FloatArray
+from slam.geometry.se3 import FloatArray, IntArray, length_of
 from slam.mapping.submap import (
     BLOCK_SIDE,
     TILE_BLOCKS,
@@ -60,10 +60,8 @@ class Piece:
     vertices: SpilledArray
     triangles: SpilledArray
     label: SpilledArray
-    shared: NDArray[np.int64]
-    shared_points: NDArray[np.float32]
-    shared_labels: NDArray[np.int64]
-    sizes: NDArray[np.int64]
+    shared: IntArray
+    sizes: IntArray
 
 
 class MapSurface:
@@ -87,7 +85,7 @@ class MapSurface:
         painter = Painter(submaps, config.voxel_size_m, config.reach_m)
         tiles = submaps.tiles()
         for done, tile in enumerate(tiles, 1):
-            patch = extract_tile(submaps, tile, config.voxel_size_m, _LEAST_WEIGHT)
+            patch = extract_tile(submaps, tile, config.voxel_size_m)
             if patch is not None and config.close_holes_m > 0:
                 # upwards in the camera of the view nearest to the tile
                 middle = (tile + 0.5) * TILE_BLOCKS * BLOCK_SIDE * config.voxel_size_m
@@ -182,8 +180,6 @@ def _piece(patch: TileSurface, painter: Painter, spill: SpillFile) -> Piece:
         put(triangles),
         put(label.astype(np.int32)),
         shared,
-        np.stack([vertices[name][shared] for name in ("x", "y", "z")], axis=1),
-        label[shared].astype(np.int64),
         np.bincount(label[triangles[:, 0]], minlength=parts),
     )
 
@@ -198,8 +194,10 @@ def _numbered(
         that is its own: those before are an earlier piece's. And how many triangles are kept.
     """
     begin = np.cumsum([0, *(len(piece.sizes) for piece in pieces)])
-    points = np.concatenate([piece.shared_points for piece in pieces])
-    part = np.concatenate([first + piece.shared_labels for first, piece in zip(begin, pieces)])
+    points = np.concatenate([Ply(piece.vertices.read()).points[piece.shared] for piece in pieces])
+    part = np.concatenate(
+        [first + piece.label.read()[piece.shared] for first, piece in zip(begin, pieces)]
+    )
     _, earliest, group = np.unique(points, axis=0, return_index=True, return_inverse=True)
     group = group.ravel()
     link = coo_array(
@@ -250,16 +248,14 @@ class TileSurface:
         )
 
 
-def extract_tile(
-    submaps: MergedSubmaps, tile: NDArray[np.int64], voxel_size_m: float, least_weight: float
-) -> TileSurface | None:
+def extract_tile(submaps: MergedSubmaps, tile: IntArray, voxel_size_m: float) -> TileSurface | None:
     """The surface of a tile and of one block around it; None where there is none.
 
     Both sides of a border between tiles see the same voxels, so that vertices there are the same bit by bit. A triangle
     belongs to the tile that its centre is in.
     """
     low = tile * TILE_BLOCKS
-    mesh = _extract(*submaps.merged(low - 1, low + TILE_BLOCKS + 1), voxel_size_m, least_weight)
+    mesh = _extract(*submaps.merged(low - 1, low + TILE_BLOCKS + 1), voxel_size_m)
     if mesh is None:
         return None
     vertices, triangles = _sorted(*mesh)
@@ -269,18 +265,14 @@ def extract_tile(
     return TileSurface(vertices, triangles, own, np.zeros(len(own), dtype=bool))
 
 
-def in_tile(points: FloatArray, tile: NDArray[np.int64], voxel_size_m: float) -> Mask:
+def in_tile(points: FloatArray, tile: IntArray, voxel_size_m: float) -> Mask:
     """Which points ``(P, 3)`` are in a tile."""
     side = voxel_size_m * BLOCK_SIDE * TILE_BLOCKS
     return (np.floor(points / side) == tile).all(axis=1)
 
 
 def _extract(
-    keys: Keys,
-    tsdf: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    voxel_size_m: float,
-    least_weight: float,
+    keys: Keys, tsdf: NDArray[np.float32], weight: NDArray[np.float32], voxel_size_m: float
 ) -> tuple[FloatArray, Triangles] | None:
     o3d = import_open3d()
     grid: Any = new_grid(voxel_size_m, len(keys))
@@ -290,7 +282,7 @@ def _extract(
         grid.attribute(name).numpy()[places.numpy()] = values.reshape(shape)
     try:
         # a frame weighs 1
-        mesh = grid.extract_triangle_mesh(least_weight - 0.5)
+        mesh = grid.extract_triangle_mesh(_LEAST_WEIGHT - 0.5)
     except RuntimeError:  # Open3D cannot build an empty geometry
         return None
     if mesh.is_empty() or not len(mesh.triangle.indices):
@@ -321,11 +313,7 @@ def _sorted(vertices: FloatArray, triangles: Triangles) -> tuple[FloatArray, Tri
 
 
 def with_holes_closed(
-    patch: TileSurface,
-    tile: NDArray[np.int64],
-    voxel_size_m: float,
-    up_world: FloatArray,
-    largest_m: float,
+    patch: TileSurface, tile: IntArray, voxel_size_m: float, up_world: FloatArray, largest_m: float
 ) -> TileSurface:
     """Close holes of at most ``largest_m`` across by triangles around a new vertex in their middle.
 
@@ -369,13 +357,13 @@ def _is_small_and_flat(corners: FloatArray, up_world: FloatArray, largest_m: flo
         return False
     (x, y, z), (u, v, w) = corners.T, corners[[*range(1, len(corners)), 0]].T
     area = 0.5 * np.array([y @ w - z @ v, z @ u - x @ w, x @ v - y @ u])
-    size = float(np.linalg.norm(area))
+    size = length_of(area)
     if size == 0 or float(-area @ up_world) < _UPWARDS * size:
         return False
     return float(np.abs(corners @ area).max()) <= _FLAT * largest_m * size
 
 
-def _rings(triangles: Triangles, upwards: FloatArray) -> list[NDArray[np.int64]]:
+def _rings(triangles: Triangles, upwards: FloatArray) -> list[IntArray]:
     """Closed rings of open edges, each vertex once, in the direction of the triangles beside them.
 
     Those of at most 100 edges whose vertices look upwards in the mean; ``upwards`` ``(V,)`` are cosines.
@@ -407,7 +395,7 @@ def _rings(triangles: Triangles, upwards: FloatArray) -> list[NDArray[np.int64]]
     return rings
 
 
-def _open_edges(triangles: Triangles, vertices: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _open_edges(triangles: Triangles, vertices: int) -> tuple[IntArray, IntArray]:
     """Begins and ends of the edges of one triangle alone, in its direction."""
     begin, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
     low, high = np.minimum(begin, end), np.maximum(begin, end)

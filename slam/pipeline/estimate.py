@@ -23,6 +23,7 @@ from slam.frontend.gps import Location
 from slam.frontend.lidar_odometry import LidarPath
 from slam.frontend.scale import Scale
 from slam.frontend.visual.depth_error import DepthError
+from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures
@@ -120,7 +121,7 @@ def fitted(mapping: MappingConfig, drive: Drive, scale_per_frame: FloatArray) ->
         known = depth[np.isfinite(depth)]
         if known.size:
             medians.append(np.median(known))
-    return mapping.in_unit(float(np.median(medians)) / _STREET_DEPTH_M) if medians else mapping
+    return mapping.in_unit(median(medians) / _STREET_DEPTH_M) if medians else mapping
 
 
 def keyframe_depths(
@@ -150,8 +151,9 @@ def keyframe_depths(
     def depth_at(n: int) -> KeyframeDepth:
         keyframe = keyframes[n]
         scale, learned = float(scale_per_frame[keyframe.index]), keyframe.depth_unscaled
-        depth, sigma = error.corrected(learned), None
-        depth = (np.minimum(depth, np.sqrt(depth * learned)) * scale).astype(np.float32)
+        unbiased, sigma = error.corrected(learned), None
+        guess = np.minimum(unbiased, np.sqrt(unbiased * learned))
+        depth = (guess * scale).astype(np.float32)
         if refiner is not None and (refined := refiner.refine(n, depth)) is not None:
             depth, sigma = refined.depth, refined.relative_sigma
             # what is fixed to the camera, as its neighbours show it, too

@@ -18,7 +18,7 @@ from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
 from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.frontend.keyframes.submaps import join
 from slam.frontend.scale import Scale
-from slam.geometry.se3 import FloatArray, invert, make, path_distance
+from slam.geometry.se3 import BoolArray, FloatArray, invert, length_of, make, path_distance
 from slam.graph.pose_graph import optimise_similarities
 from slam.loops.closure import LoopClosures, Track, find_loops, most_inliers_first
 from slam.loops.verification import OF_KEYFRAMES, Loop, LoopVerifier
@@ -140,7 +140,7 @@ class _Rows:
             views += segment.views(np.where(settled, segment.points, np.nan))
         return views
 
-    def apart(self) -> NDArray[np.bool_]:
+    def apart(self) -> BoolArray:
         """Which keyframes share few tracks ``(K, K)``."""
         first = np.cumsum([0, *(len(segment.points) for segment in self.segments)])
         tracks = [
@@ -198,7 +198,7 @@ def _joined(
         for last in range(first + 1, min(first + 1 + _NEIGHBOURS, len(chosen))):
             if rows.maps[row] == rows.maps[chosen[last]]:
                 T_step = invert(rows.T_map_camera[row]) @ rows.T_map_camera[chosen[last]]
-                length = _RELATIVE_SIGMA * float(np.linalg.norm(T_step[:3, 3])) + _LEAST_SIGMA
+                length = _RELATIVE_SIGMA * length_of(T_step[:3, 3]) + _LEAST_SIGMA
                 sigmas = np.repeat([_ROTATION_SIGMA, length], 3)
                 pose = RelativePose(first, last, T_step, sigmas, KEYFRAME_SOURCE)
                 edges.append((pose, 1.0, _SCALE_SIGMA))

@@ -24,6 +24,7 @@ from slam.frontend.drive import DOUBLED
 from slam.frontend.gps import GpsFixes, Location
 from slam.frontend.lidar_odometry import LidarPath
 from slam.frontend.visual.odometry import STILL_SOURCE
+from slam.geometry.robust import median, rms
 from slam.geometry.se3 import FloatArray, path_distance, umeyama
 from slam.graph.pose_graph import whitened_squared
 from slam.loops.closure import MOST_REJECTED, LoopClosures
@@ -281,7 +282,7 @@ def _tracking(result: Estimate) -> records.TrackingMetrics | Failed:
 def _depth_error(result: Estimate) -> list[dict[str, float | None]] | Failed:
     """Bias and sigma of learned depth over distance at the end of the drive, in the unit of the trajectory."""
     curve = result.drive.measured.depth_error.curve()
-    unit = float(np.median(result.scale.per_frame))
+    unit = median(result.scale.per_frame)
     if not curve:
         return Failed("no step triangulated corners with learned depth")
     return [
@@ -322,9 +323,7 @@ def _distances(
     apart = fixes.offsets(T_enu_world @ trajectory.T_world_camera)
     level = np.linalg.norm(apart[:, :2], axis=1)
     return records.GpsErrors.of(
-        horizontal_rmse_m=float(np.sqrt((level**2).mean())),
-        horizontal_median_m=float(np.median(level)),
-        vertical_rmse_m=float(np.sqrt((apart[:, 2] ** 2).mean()))
-        if fixes.has_heights
-        else _NO_HEIGHTS,
+        horizontal_rmse_m=rms(level),
+        horizontal_median_m=median(level),
+        vertical_rmse_m=rms(apart[:, 2]) if fixes.has_heights else _NO_HEIGHTS,
     )

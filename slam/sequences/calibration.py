@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from erfsfm.common.progress import Progress
 from slam.frames import Grey
+from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SlamError
 from slam.sequences.images import ImageSource
@@ -201,8 +202,8 @@ def chosen_views(views: list[View]) -> list[View]:
 
     The next is always the one whose place is furthest from those of all before, times its sharpness' rank.
     """
-    median = float(np.median([view.sharpness for view in views]))
-    sharp = [view for view in views if view.sharpness >= _BLURRED * median]
+    usual = median([view.sharpness for view in views])
+    sharp = [view for view in views if view.sharpness >= _BLURRED * usual]
     if len(sharp) <= _MOST_VIEWS:
         return sharp
     ranks = np.argsort(np.argsort([view.sharpness for view in sharp])) / (len(sharp) - 1)

@@ -23,6 +23,7 @@ from erfsfm.common.errors import DataError
 from erfsfm.common.readers.kitti import drive_name, find_odometry_root
 from erfsfm.common.readers.video import VIDEO_SUFFIXES
 from slam.frames import Image
+from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError, sequence_errors
 from slam.runtime.imports import import_plug_in, plug_ins
@@ -308,7 +309,7 @@ def open_series(pieces: Sequence[Piece], openers: Sequence[Opener]) -> RecordedS
 
 
 def _stamps(pieces: Sequence[Piece], stamps: Sequence[FloatArray]) -> FloatArray:
-    period = float(np.median(np.concatenate([np.diff(each) for each in stamps])))
+    period = median(np.concatenate([np.diff(each) for each in stamps]))
     tick_s = _tick_s(pieces, max(float(np.ptp(each)) for each in stamps))
     joined = [stamps[0]]
     for before, piece, each in zip(pieces, pieces[1:], stamps[1:]):

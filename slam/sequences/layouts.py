@@ -26,6 +26,7 @@ from erfsfm.common.readers.numbering import NumberedFiles, by_name, by_table
 from slam.formats.rows import BadRows, in_seconds, number_or_nan, rows_of
 from slam.formats.trajectory import nearest_stamps, read_trajectory
 from slam.geometry import se3
+from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import (
@@ -253,7 +254,7 @@ def _open_tum_mono(folder: Path, asked: Path | None) -> RecordedSequence:
         raise SequenceError(f"no images in {folder / 'images'}: unpack images.zip there")
     files = by_name(list_images(folder / "images"))
     stamps = read_stamps(folder / "times.txt", files)
-    fps = 1.0 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
+    fps = 1.0 / median(np.diff(stamps)) if len(stamps) > 1 else 1.0
     truth = _truth(folder / "groundtruthSync.txt", stamps)
     own = partial(_fov_camera, folder / "camera.txt", fps)
     return _recorded(

@@ -23,6 +23,7 @@ from erfsfm.common.readers.video import (
     list_videos,
     video_name,
 )
+from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import find_camera_file
@@ -132,7 +133,7 @@ def _times_of_frames(path: Path, frames: VideoFrames, fps: float) -> FloatArray:
     rates = [frames.fps] if frames.fps else []
     if rates and times_s is not None and len(times_s) > 1:
         # missing frames lower the mean rate alone
-        rates.append(1.0 / float(np.median(np.diff(times_s))))
+        rates.append(1.0 / median(np.diff(times_s)))
     if rates and all(abs(rate / fps - 1) > _RATE_TOLERANCE for rate in rates):
         text = (
             "%s has %.4g frames a second, the camera has %g: taken as even at the camera's rate; correct fps, unless "

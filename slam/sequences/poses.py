@@ -6,14 +6,13 @@ import logging
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from erfsfm.common.files import read_text
 from slam.formats.trajectory import other_unit, read_trajectory
 from slam.frames import runs
 from slam.geometry import se3
-from slam.geometry.se3 import FloatArray
+from slam.geometry.se3 import BoolArray, FloatArray
 from slam.runtime.errors import SequenceError
 
 logger = logging.getLogger(__name__)
@@ -98,7 +97,7 @@ def poses_near(
     return T_near
 
 
-def known_poses(T_any_camera: FloatArray) -> NDArray[np.bool_]:
+def known_poses(T_any_camera: FloatArray) -> BoolArray:
     """Which of the poses ``(N, 4, 4)`` are known."""
     return np.asarray(np.isfinite(T_any_camera).all(axis=(1, 2)))
 

@@ -21,6 +21,7 @@ from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.numbering import NumberedFiles
 from slam.formats.rows import BadRows, in_seconds, number_or_nan, rows_of
 from slam.frames import Frame, Image, Intrinsics, Mask
+from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray, is_se3
 from slam.runtime.errors import SequenceError, SlamError, sequence_errors
 from slam.sequences.camera_file import Undistortion, fixed_to, require_size, undistorted
@@ -236,7 +237,7 @@ def _require_plausible_rate(name: str, stamps: FloatArray) -> None:
     if len(stamps) < 2:
         return
     periods = np.diff(stamps)
-    period, longest = float(np.median(periods)), float(periods.max())
+    period, longest = median(periods), float(periods.max())
     if not POSSIBLE_PERIODS_S[0] <= period <= POSSIBLE_PERIODS_S[1]:
         raise SequenceError(
             f"{name}: its frames are {period:g} s apart: check its stamps, or fps, and their unit"
@@ -340,7 +341,7 @@ def _mended_stamps(stamps: FloatArray, path: Path) -> FloatArray:
         bad.say(0, wanted)
     rows, times = np.sort(rows[order]), times[order]
     # at both ends the rate goes on
-    beyond, period = (len(stamps), float(np.median(np.diff(times) / np.diff(rows))))
+    beyond, period = (len(stamps), median(np.diff(times) / np.diff(rows)))
     times = np.r_[times[0] - beyond * period, times, times[-1] + beyond * period]
     known = np.r_[rows[0] - beyond, rows, rows[-1] + beyond]
     return np.interp(np.arange(1, len(stamps) + 1), known, times)

@@ -18,6 +18,7 @@ from erfsfm.common.readers.images import first_usual, stretch_of
 from slam.formats.rows import BadRows
 from slam.formats.trajectory import nearest_pairs
 from slam.frames import Image
+from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray, invert
 from slam.runtime.errors import SequenceError
 from slam.sequences import bag as bags
@@ -230,7 +231,7 @@ def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> Recorde
     bag = Bag(path)
     messages = StampedMessages(bag, topic)
     stored, stamps = images_of(messages, f"an image of {topic} in {bag.path}"), messages.stamps
-    fps = 1.0 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
+    fps = 1.0 / median(np.diff(stamps)) if len(stamps) > 1 else 1.0
     calibration = partial(_calibration, bag, topic, fps, (stored.width, stored.height))
     camera = find_camera_file(
         asked, path.absolute().parent, wanted_by=str(path), images=stored, own=calibration

@@ -1,10 +1,12 @@
 """Triangle meshes with materials, and the terrain that the streets of a plan are bent onto."""
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+
+from slam.geometry import se3
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -94,7 +96,7 @@ class Bend:
             sway_y = self.amplitudes[1] * np.sin(k[1] * x + self.phases[1, 0])
             return np.stack([x + sway_x, y + sway_y, z + hill], axis=-1)
         steps = np.arange(len(self.road)) + self.road_start
-        centre_x, centre_y, heading = interpolated(x, steps, self.road).T
+        centre_x, centre_y, heading = se3.interpolated(x, steps, self.road).T
         return np.stack(
             [centre_x - y * np.sin(heading), centre_y + y * np.cos(heading), z + hill], axis=-1
         )
@@ -137,11 +139,6 @@ def road_bend(
         )
     position = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], 1), axis=0)
     return replace(town, road=np.column_stack([position, heading]), road_start=float(s[0]))
-
-
-def interpolated(at: FloatArray, known: NDArray[Any], rows: FloatArray) -> FloatArray:
-    """Rows ``(M, C)`` of increasing places ``(M,)`` at other places ``(N,)``, ``(N, C)``."""
-    return np.stack([np.interp(at, known, column) for column in rows.T], axis=-1)
 
 
 def unit(rows: FloatArray) -> FloatArray:

@@ -12,15 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
-from slam.simulation.geometry import (
-    Bend,
-    FloatArray,
-    interpolated,
-    luck,
-    road_bend,
-    town_bend,
-    unit,
-)
+from slam.simulation.geometry import Bend, FloatArray, luck, road_bend, town_bend, unit
 from slam.simulation.options import StreetKind, Variety
 
 Node = tuple[int, int]
@@ -365,7 +357,7 @@ def _resample(path: FloatArray) -> FloatArray:
     """Points every ``STEP`` metres along a polyline."""
     length = se3.distance_along(path)
     along = np.arange(0.0, length[-1], STEP)
-    return interpolated(along, length, path)
+    return se3.interpolated(along, length, path)
 
 
 def _arrival(bend: Bend, lane_plan: FloatArray, stops: bool, moving: int) -> FloatArray:
@@ -404,9 +396,9 @@ def _poses(
     """
     rows = np.arange(len(lane_plan))
     direction = gaussian_filter1d(np.gradient(lane_plan, axis=0), 4.0, axis=0)
-    tangent = interpolated(sample, rows, direction)
+    tangent = se3.interpolated(sample, rows, direction)
     tangent = unit(tangent)
-    at, ahead = _level(interpolated(sample, rows, lane_plan)), _level(tangent)
+    at, ahead = _level(se3.interpolated(sample, rows, lane_plan)), _level(tangent)
     across = np.stack([tangent[:, 1], -tangent[:, 0], np.zeros(len(at))], axis=1)
     forward = bend(at + ahead) - bend(at - ahead)
     right = bend(at + across) - bend(at - across)

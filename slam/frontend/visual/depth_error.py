@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from slam.frames import DepthMap
 from slam.geometry.robust import weighted_median
-from slam.geometry.se3 import FloatArray
+from slam.geometry.se3 import FloatArray, IntArray
 
 # learned depth is counted in half octaves, in the unit of the networks
 _DEPTHS = 2.0 ** np.arange(-6.0, 9.0, 0.5)
@@ -32,6 +32,7 @@ _PRIOR_SIGMA = 0.2
 _LEAST_SIGMA = 0.1
 _USUAL_SIGMA = 0.15
 _USUAL_FAR_SIGMA = 0.25
+_FAR_CORNERS = 0.05  # least corners over the most of a distance
 # what moves along with the camera, as a car beside it, is triangulated far behind its place: that is
 # no error of learned depth
 _LEAST_RATIO = float(np.exp(_LOGARITHMS[0]))
@@ -99,15 +100,11 @@ class DepthError:
         np.add.at(noise, depths, weights * spread)
         return type(self)(corners, noise)
 
-    def most_too_far(self, least: float) -> float | None:
-        """The largest bias towards far, less where the depth there scatters more than usual; None without corners.
-
-        Args:
-            least: corners at a distance, over the most at any, that its bias counts.
-        """
+    def most_too_far(self) -> float | None:
+        """The largest bias towards far, less where the depth there scatters more than usual; None without corners."""
         corners = self.corners.sum(axis=1)
         bias = self.bias / np.maximum(self._spread / _USUAL_FAR_SIGMA, 1.0)
-        counted = bias[corners > least * corners.max()]
+        counted = bias[corners > _FAR_CORNERS * corners.max()]
         return float(counted.max()) if len(counted) else None
 
     def curve(self) -> list[tuple[float, float, float, float]]:
@@ -153,7 +150,7 @@ class DepthError:
         return np.array([np.interp(share, row, edges) for row in cumulative])
 
 
-def _nearest(values: FloatArray, places: NDArray[np.floating[Any]]) -> NDArray[np.int64]:
+def _nearest(values: FloatArray, places: NDArray[np.floating[Any]]) -> IntArray:
     """Row of the nearest of evenly spaced ``places`` ``(P,)`` for values ``(M,)``, beyond its ends the last."""
     rows = np.rint((values - places[0]) / (places[1] - places[0]))
     return np.asarray(np.clip(rows, 0, len(places) - 1), np.int64)

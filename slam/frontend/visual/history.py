@@ -8,8 +8,8 @@ from typing import Self
 import numpy as np
 
 from slam.geometry.multiview import UnitRelativePose
-from slam.geometry.robust import mad_sigma
-from slam.geometry.se3 import FloatArray
+from slam.geometry.robust import mad_sigma, median
+from slam.geometry.se3 import FloatArray, length_of
 
 AXIS_SIGMA = float(np.deg2rad(8.0))  # least sigma of the direction of motion, radians
 _STEPS_KEPT = 100
@@ -59,7 +59,7 @@ class MotionHistory:
     def is_sudden_loss(self, inlier_ratio: float) -> bool:
         """Whether a third of the usual inliers are outliers now."""
         known = len(self.inlier_ratios) >= _LEAST_STEPS
-        return known and inlier_ratio < _SUDDEN_SHARE * float(np.median(self.inlier_ratios))
+        return known and inlier_ratio < _SUDDEN_SHARE * median(self.inlier_ratios)
 
     def is_possible_speed(self, speed: float, seconds: float) -> bool | None:
         """Whether a car can have this speed after a step of so many seconds; None where speeds are unknown.
@@ -69,7 +69,7 @@ class MotionHistory:
         """
         if len(self.speeds) < _SPEEDS or not np.isfinite([*self.speeds, speed]).all():
             return None
-        usual = float(np.median(self.speeds))
+        usual = median(self.speeds)
         passed = seconds * (_SPEEDS + 1) / 2
         return abs(
             speed - usual
@@ -81,6 +81,6 @@ class MotionHistory:
             return MotionPrior(np.zeros(3), np.inf)
         directions = np.array(self.directions)
         axis = np.median(directions, axis=0)
-        axis = axis / max(float(np.linalg.norm(axis)), 1e-9)
+        axis = axis / max(length_of(axis), 1e-9)
         spread = mad_sigma(np.arccos(np.clip(directions @ axis, -1.0, 1.0)))
         return MotionPrior(axis, float(np.hypot(AXIS_SIGMA, spread)))

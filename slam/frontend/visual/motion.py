@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam.frames import Ends, RelativePose
-from slam.geometry.se3 import FloatArray, invert
+from slam.geometry.se3 import FloatArray, invert, length_of
 
 _LEAST_RELATIVE_SIGMA = 1e-3
 
@@ -48,7 +48,7 @@ class Motion:
     @property
     def length_unscaled(self) -> float:
         """Length of the translation, in the unit of learned depth."""
-        return float(np.linalg.norm(self.relative_pose.T_from_to[:3, 3]))
+        return length_of(self.relative_pose.T_from_to[:3, 3])
 
     @property
     def corner_sigmas(self) -> FloatArray:
@@ -108,7 +108,7 @@ def pose_sigmas(
     length.
     """
     along = np.abs(invert(T_previous_current)[:3, 3])
-    length = float(np.linalg.norm(along))
+    length = length_of(along)
     translation = np.hypot(length * of_unit_pose[3:], length_relative_sigma * along)
     return np.concatenate(
         [of_unit_pose[:3], np.maximum(translation, _LEAST_RELATIVE_SIGMA * length)]

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from slam.frames import Ends
 from slam.frontend.visual.motion import Motion, links
 from slam.geometry.robust import MAD_TO_SIGMA
-from slam.geometry.se3 import FloatArray, invert
+from slam.geometry.se3 import FloatArray, invert, length_of
 
 # sigmas over the jitter and over the residual, by Student's t on KITTI 00 and five simulated
 # drives; ratios of other drives cover no better (docs/design/noise-and-the-pose-graph.md)
@@ -50,7 +50,7 @@ def step_noise(motions: Mapping[Ends, Motion], frames: int) -> dict[Ends, FloatA
         T_previous_current = motions[ends].relative_pose.T_from_to
         towards = invert(T_previous_current)[:3, 3]
         values[row, :3] = Rotation.from_matrix(T_previous_current[:3, :3]).as_rotvec()
-        values[row, 3:] = towards / max(float(np.linalg.norm(towards)), 1e-12)
+        values[row, 3:] = towards / max(length_of(towards), 1e-12)
         own[row] = motions[ends].corner_sigmas
     jitter = _unexplained(rotation_jitter(values[:, :3]), np.nanmedian(own[:, :3], axis=0))
     residual = _unexplained(neighbour_residual(values), _NEIGHBOUR_RESIDUAL_OF_NOISE * own)

@@ -17,7 +17,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.frames import (
     DepthMap,
@@ -53,8 +52,8 @@ from slam.geometry.multiview import (
     triangulated_depth,
     triangulated_nearness,
 )
-from slam.geometry.robust import MAD_TO_SIGMA, mad_sigma, weighted_median
-from slam.geometry.se3 import FloatArray, apply, invert, make
+from slam.geometry.robust import MAD_TO_SIGMA, mad_sigma, median, weighted_median
+from slam.geometry.se3 import BoolArray, FloatArray, IntArray, apply, invert, length_of, make
 from slam.runtime.errors import Failed
 
 logger = logging.getLogger(__name__)
@@ -125,7 +124,7 @@ class VisualOdometry:
         self._points: tuple[int, TriangulatedPoints | None] = (-1, None)
         # tracks that fitted the last motion have the vote on the next one: what passes between the
         # camera and the world never did, however many corners it has
-        self._fitted: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._fitted: IntArray = np.zeros(0, np.int64)
 
     def measure(
         self,
@@ -219,7 +218,7 @@ class VisualOdometry:
     def _matches(
         self,
         tracks: Tracks,
-        votes: NDArray[np.bool_],
+        votes: BoolArray,
         learned: FloatArray,
         height: float | None,
         mask: DynamicMask,
@@ -240,12 +239,7 @@ class VisualOdometry:
         return Matches(rays_previous, rays_current, depth, sigma, on_road, weights, votes, focal_px)
 
     def _still(
-        self,
-        ends: Ends,
-        seconds: float,
-        tracks: Tracks,
-        votes: NDArray[np.bool_],
-        depth: FloatArray,
+        self, ends: Ends, seconds: float, tracks: Tracks, votes: BoolArray, depth: FloatArray
     ) -> Motion | None:
         """No motion, None where near corners move: hills and gantries far ahead stand at any speed.
 
@@ -256,7 +250,7 @@ class VisualOdometry:
         if near.sum() >= MIN_INLIERS:
             is_shared = (votes & near).sum() >= max(MIN_INLIERS, _LEAST_SHARED * near.sum())
             votes = votes & near if is_shared else near
-        flow = float(np.median(flows[votes]))
+        flow = median(flows[votes])
         has_stopped = self._history.is_possible_speed(0.0, seconds) is not False
         if flow >= _STILL_FLOW_PX or not (has_stopped and np.isfinite(depth).any()):
             return None
@@ -274,7 +268,7 @@ class VisualOdometry:
         self,
         frames: tuple[Frame, Frame],
         tracks: Tracks,
-        votes: NDArray[np.bool_],
+        votes: BoolArray,
         learned: FloatArray,
         height: float | None,
     ) -> Motion | Failed | None:
@@ -398,7 +392,7 @@ class VisualOdometry:
         return Step(motion, two_view, triangulated)
 
     def _by_points(
-        self, ends: Ends, tracks: Tracks, votes: NDArray[np.bool_], depth: FloatArray
+        self, ends: Ends, tracks: Tracks, votes: BoolArray, depth: FloatArray
     ) -> Motion | Failed:
         """Perspective-n-point of the later image's corners on the earlier frame's learned depth."""
         known = np.isfinite(depth)
@@ -430,7 +424,7 @@ class VisualOdometry:
         if support < _LEAST_SUPPORT:
             return Failed(f"little parallax, and only {fits.sum()} of {tracks.sought} corners fit")
         self._fitted = tracks.track_ids[known][fits]
-        length = float(np.linalg.norm(resection.T_camera_world[:3, 3]))
+        length = length_of(resection.T_camera_world[:3, 3])
         # errors of corners are correlated, and so are those of learned depth
         floors = np.repeat([_LEAST_ROTATION_SIGMA, _LEARNED_RELATIVE_SIGMA * length], 3)
         sigmas = np.hypot(CORNER_CORRELATION * resection.sigmas, floors)
@@ -446,7 +440,7 @@ class TriangulatedPoints:
     is that of both.
     """
 
-    track_ids: NDArray[np.int64]
+    track_ids: IntArray
     depth_previous: FloatArray
     depth_current: FloatArray
     relative_sigma: FloatArray
@@ -528,7 +522,7 @@ def most_credible(
         if height_unscaled is not None and road.sum() >= _LEAST_ROAD_CORNERS:
             rays = matches.rays_previous[road]
             depth = triangulated_depth(rays, matches.rays_current[road], step.two_view.unit_pose)
-            height = float(np.median(depth * rays[:, 1])) * step.motion.length_unscaled
+            height = median(depth * rays[:, 1]) * step.motion.length_unscaled
             votes.append(bool(abs(np.log(max(height, 1e-9) / height_unscaled)) < _AGREEMENT))
         # the direction is about the median of the last hundred steps, which a few wrong ones do not
         # change

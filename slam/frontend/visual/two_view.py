@@ -17,11 +17,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any, Self
+from typing import Self
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from scipy import ndimage
 
 from slam.frontend.visual.history import AXIS_SIGMA, MotionHistory, MotionPrior
 from slam.geometry.multiview import (
@@ -32,7 +32,7 @@ from slam.geometry.multiview import (
     unit_pose_by_pnp,
 )
 from slam.geometry.robust import mad_sigma, weighted_median
-from slam.geometry.se3 import FloatArray, compose, rotation_matrix
+from slam.geometry.se3 import BoolArray, FloatArray, IntArray, compose, rotation_matrix
 
 _ITERATIONS = 10
 # over-relaxation: reweighting alone converges by half of the distance an iteration
@@ -93,9 +93,9 @@ class Matches:
     rays_current: FloatArray
     depth_previous: FloatArray
     depth_sigma: FloatArray
-    on_road: NDArray[np.bool_]
+    on_road: BoolArray
     weights: FloatArray
-    votes: NDArray[np.bool_]
+    votes: BoolArray
     focal_px: float
 
     def by_geometry_alone(self) -> Matches:
@@ -142,8 +142,8 @@ class TwoViewEstimate:
     unit_pose: UnitRelativePose
     covariance: FloatArray
     noise_px: float
-    inliers: NDArray[np.bool_]
-    agreeing: NDArray[np.bool_]
+    inliers: BoolArray
+    agreeing: BoolArray
 
 
 def estimate(matches: Matches, history: MotionHistory, seed: int = 0) -> TwoViewEstimate | None:
@@ -244,12 +244,8 @@ def _refined(
 
 
 def _inliers(
-    matches: Matches,
-    near: NDArray[np.bool_],
-    shift_px: FloatArray,
-    seen_px: FloatArray,
-    parallax_px: float,
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    matches: Matches, near: BoolArray, shift_px: FloatArray, seen_px: FloatArray, parallax_px: float
+) -> tuple[BoolArray, BoolArray]:
     """Which corners near their epipolar lines fit learned depth ``(M,)``, and which are inliers ``(M,)``.
 
     The majority of the parallax in the image decides on the length by which learned depth is
@@ -284,7 +280,7 @@ def _with_first_sigma(matches: Matches, motions: Sequence[UnitRelativePose | Non
     return replace(matches, depth_sigma=np.maximum(matches.depth_sigma, error))
 
 
-def _support(candidate: TwoViewEstimate, votes: NDArray[np.bool_], prior: MotionPrior) -> float:
+def _support(candidate: TwoViewEstimate, votes: BoolArray, prior: MotionPrior) -> float:
     """Number of votes of inliers that agree with learned depth, less the cost of leaving the usual axis."""
     deviation = prior.deviation(candidate.unit_pose.direction)
     return float(candidate.agreeing[votes].sum()) - 0.5 * deviation**2 / _OUTLIER_COST
@@ -405,7 +401,7 @@ class DynamicMask:
         ratio = (inliers + _PRIOR_CORNERS * usual) / (corners + _PRIOR_CORNERS)
         return np.minimum(ratio[self._cells(pixels)] / max(usual, 1e-3), 1.0) ** _SHARPNESS
 
-    def updated(self, pixels: FloatArray, is_inlier: NDArray[np.bool_]) -> Self:
+    def updated(self, pixels: FloatArray, is_inlier: BoolArray) -> Self:
         """The mask after one more step, whose corners now lie at ``pixels`` ``(M, 2)``."""
         inliers, corners = _KEPT * self.inliers, _KEPT * self.corners
         cells = self._cells(pixels)
@@ -413,7 +409,7 @@ class DynamicMask:
         np.add.at(inliers, cells, is_inlier.astype(float))
         return type(self)(inliers, corners)
 
-    def _cells(self, pixels: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def _cells(self, pixels: FloatArray) -> tuple[IntArray, IntArray]:
         column, row = (np.floor(pixels.T / _CELL_PX)).astype(np.int64)
         height, width = self.corners.shape
         return np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
@@ -421,12 +417,12 @@ class DynamicMask:
 
 def moving_corners(
     pixels: FloatArray,
-    on_road: NDArray[np.bool_],
-    agreeing: NDArray[np.bool_],
-    contradicting: NDArray[np.bool_],
+    on_road: BoolArray,
+    agreeing: BoolArray,
+    contradicting: BoolArray,
     expected_px: FloatArray,
     seen_px: FloatArray,
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Which of the contradicting corners ``(M,)`` lie in a region that moves.
 
     Args:
@@ -452,18 +448,9 @@ def moving_corners(
     parallax = np.where(agreeing | contradicting, np.abs(seen_px), 0.0)
     on_road_px = np.bincount(region, (parallax * on_road)[contradicting], count)
     is_most_of_road = on_road_px > _LARGEST_SHARE * parallax[on_road].sum()
-    middle = _medians(motion, region, count)
-    scatter = _medians(np.abs(motion - middle[region]), region, count)
+    regions = np.arange(count)
+    middle = ndimage.median(motion, region, regions)
+    scatter = ndimage.median(np.abs(motion - middle[region]), region, regions)
     moving[contradicting] = (~is_most_of_road & (scatter < _CONSISTENCY * np.abs(middle)))[region]
     is_most = parallax[moving].sum() > _LARGEST_SHARE * parallax.sum()
     return np.zeros_like(moving) if is_most else moving
-
-
-def _medians(values: FloatArray, groups: NDArray[np.integer[Any]], count: int) -> FloatArray:
-    """The median of the values ``(K,)`` of each group, ``(count,)``; 0 of an empty one."""
-    order, sizes = np.lexsort((values, groups)), np.bincount(groups, minlength=count)
-    first, last = np.cumsum(sizes) - sizes, len(values) - 1
-    below, above = (
-        np.minimum(first + np.maximum(half, 0), last) for half in ((sizes - 1) // 2, sizes // 2)
-    )
-    return np.where(sizes > 0, 0.5 * (values[order[below]] + values[order[above]]), 0.0)

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from slam.evaluation.trajectory import FIGURE_LENGTHS_M, aligned, paired, segment_errors
 from slam.formats.ply import R_UP_WORLD
 from slam.formats.trajectory import Trajectory, associate
-from slam.geometry.se3 import FloatArray, apply, invert, path_distance, rotation_angle
+from slam.geometry.se3 import FloatArray, IntArray, apply, invert, path_distance, rotation_angle
 from slam.results.folder import RunFolder
 from slam.results.metrics import AcceptedLoop, Stretch
 from slam.runtime.errors import RunError
@@ -49,7 +49,7 @@ _SEEN_WITHIN = 40.0
 _NEAR_PERCENT = 10
 _HALF_FIELD = np.array([0.9, 0.5])  # tangents, of width and height
 
-Mesh = tuple[FloatArray, NDArray[np.uint8], NDArray[np.int64]]
+Mesh = tuple[FloatArray, NDArray[np.uint8], IntArray]
 """Vertices ``(V, 3)`` in the world, y down, their RGB colours ``(V, 3)``, and triangles ``(T, 3)``."""
 
 
@@ -283,7 +283,7 @@ class MapView:
 
     points: FloatArray
     colours: NDArray[np.uint8]
-    triangles: NDArray[np.int64]
+    triangles: IntArray
     T_world_camera: FloatArray
     frame: int
     ahead: float

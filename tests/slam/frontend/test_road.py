@@ -118,7 +118,7 @@ def test_a_car_that_covers_the_road_is_refused(texture):
     """All that the strip shows far ahead drives as fast as the camera, and below it the road is even."""
     step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
     failure = RoadHomography(CAMERA).measure(*behind_a_car(texture, rows=90), step)
-    assert isinstance(failure, Failed) and "stands still" in failure.reason
+    assert isinstance(failure, Failed)
 
 
 def test_before_a_car_that_hides_most_of_the_road_the_short_strip_measures(texture):

@@ -195,32 +195,15 @@ def test_g2o_round_trip_through_gtsam(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_newest_loops_are_dropped_when_the_system_is_singular(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_system_that_cannot_be_solved_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     _, odometry, _, loops, initial = noisy_problem(count=40)
-    optimiser = gtsam.LevenbergMarquardtOptimizer
-    most = len(odometry) + 2  # the factor that fixes the first pose, and one loop
 
-    def singular_above(graph: Any, *others: Any) -> Any:
-        if graph.size() > most:
-            raise RuntimeError("\nIndeterminant linear system detected\nlong explanation")
-        return optimiser(graph, *others)
+    def singular(*parts: Any) -> None:
+        raise RuntimeError("\nIndeterminant linear system detected\nlong explanation")
 
-    monkeypatch.setattr(gtsam, "LevenbergMarquardtOptimizer", singular_above)
-    graph, solved = solve(odometry[:10] + loops[:3] + odometry[10:], initial)
-    assert graph.dropped == [loops[2], loops[1]]
-    assert graph.relative_poses == odometry[:10] + loops[:1] + odometry[10:]
-    np.testing.assert_array_equal(
-        solved, solve(odometry[:10] + loops[:1] + odometry[10:], initial)[1]
-    )
-    most = 0
+    monkeypatch.setattr(gtsam, "LevenbergMarquardtOptimizer", singular)
     with pytest.raises(SlamError, match=r"^the pose graph cannot be solved: Ind.* detected$"):
-        graph.optimise(initial)
-    assert graph.dropped == [loops[2], loops[1], loops[0]] and graph.relative_poses == odometry
-    many = [replace(loops[0], T_from_to=loops[0].T_from_to.copy()) for _ in range(12)]
-    with pytest.raises(SlamError, match="even without 11 loop edges"):
-        solve(odometry + many, initial)
+        solve(odometry + loops, initial)
 
 
 def test_a_loop_contradicted_by_the_rest_is_dropped():

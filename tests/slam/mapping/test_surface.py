@@ -32,7 +32,7 @@ def test_the_order_of_vertices_in_one_place_is_that_of_their_triangles(
         monkeypatch.setattr(
             surface, "_extract", lambda *_, o=order, p=place: (vertices[list(o)], p[triangles])
         )
-        mesh = extract_tile(submaps, np.zeros(3, dtype=np.int64), 0.1, 1.0)
+        mesh = extract_tile(submaps, np.zeros(3, dtype=np.int64), 0.1)
         found.append((mesh.vertices, mesh.triangles))
     assert all(np.array_equal(v, found[0][0]) and np.array_equal(t, found[0][1]) for v, t in found)
     assert len({tuple(vertex) for vertex in found[0][0]}) == 5

@@ -127,14 +127,13 @@ def check_camera(seen: FollowedCorners, stated: Intrinsics) -> FoundCamera:
     for each so many keyframes.
     """
     told: list[Window | None] = []
-    found, pairs = joined(told), seen.keyframe.max(initial=0) // _KEYFRAMES_CHECKED
+    pairs = seen.keyframe.max(initial=0) // _KEYFRAMES_CHECKED
     for window in windows_that_turn(seen)[: 2 * pairs]:
         longest = np.argsort(-np.bincount(window.point), kind="stable")[:_CHECKED]
         told.append(calibrated(window.chosen(np.isin(window.point, longest), least=2)[0]))
-        found = joined(told)
-        if found.sigmas_from(stated) < _DOUBTFUL:
+        if joined(told).sigmas_from(stated) < _DOUBTFUL:
             break
-    return found
+    return joined(told)
 
 
 @dataclass(frozen=True)

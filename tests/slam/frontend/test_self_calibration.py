@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from erfsfm.common.readers.camera_file import UNKNOWN_FX_SIGMA
-from slam.frames import Frame
+from slam.frames import Frame, Intrinsics
 from slam.frontend.followed_corners import follow
 from slam.frontend.self_calibration import (
     calibrated,
@@ -61,7 +61,7 @@ def test_a_lens_is_known_where_the_focal_length_is_not() -> None:
     """A straight street through a lens that draws corners in by an eighth; it bends the paths of the points."""
     straight = replace(STREET, route="straight", height=208)
     half, radial = WIDTH / 2, -0.12
-    K = np.array([[half, 0.0, half - 0.5], [0.0, half, 103.5], [0.0, 0.0, 1.0]])
+    K = Intrinsics(WIDTH, 208, half, half, half - 0.5, 103.5).K
     pixels = np.mgrid[:208, :WIDTH][::-1].reshape(2, -1).T.astype(np.float64)
     ideal = cv2.undistortPoints(pixels, K, np.array([radial, 0.0, 0.0, 0.0]), P=K)
     columns_rows = ideal.reshape(208, WIDTH, 2).astype(np.float32)

@@ -150,8 +150,8 @@ def keyframe_depths(
     def depth_at(n: int) -> KeyframeDepth:
         keyframe = keyframes[n]
         scale, learned = float(scale_per_frame[keyframe.index]), keyframe.depth_unscaled
-        depth, sigma = error.corrected(learned), None
-        depth = (np.minimum(depth, np.sqrt(depth * learned)) * scale).astype(np.float32)
+        unbiased, sigma = error.corrected(learned), None
+        depth = (np.minimum(unbiased, np.sqrt(unbiased * learned)) * scale).astype(np.float32)
         if refiner is not None and (refined := refiner.refine(n, depth)) is not None:
             depth, sigma = refined.depth, refined.relative_sigma
             # what is fixed to the camera, as its neighbours show it, too

@@ -313,19 +313,15 @@ def _fit_sigma(net: FusionNet, data: Sequence[Sample]) -> dict[str, float]:
         evidence, wanted, is_known = _batch(data[first : first + _BATCH])
         change, log_sigma = net(evidence)
         measured = functional.pixel_shuffle(evidence[:, 4 * CHANGE : 4 * CHANGE + 4], 2)[:, 0]
-        for name, found in (
-            ("guess", torch.zeros_like(change)),
-            ("measured", measured),
-            ("fused", change),
-        ):
-            errors[name].append((torch.exp((wanted - found)[is_known]) - 1).abs())
+        for parts, found in zip(errors.values(), (torch.zeros_like(change), measured, change)):
+            parts.append((torch.exp((wanted - found)[is_known]) - 1).abs())
         ratios.append(((wanted - change).abs() * torch.exp(-log_sigma))[is_known])
     every = torch.cat(ratios)[::7]
     factor = torch.quantile(every[: 10**7], _COVERAGE) / _SIGMAS
     assert net.head.bias is not None
     net.head.bias[8:] += torch.log(factor)
-    all_errors = {name: torch.cat(parts) for name, parts in errors.items()}
-    metrics = {f"{name}_mean": float(each.mean()) for name, each in all_errors.items()}
-    for name, each in all_errors.items():
-        metrics[f"{name}_median"] = float(each.median())
+    metrics: dict[str, float] = {}
+    for name, parts in errors.items():
+        each = torch.cat(parts)
+        metrics |= {f"{name}_mean": float(each.mean()), f"{name}_median": float(each.median())}
     return metrics

@@ -21,7 +21,6 @@ from erfsfm.common.files import write_atomically
 from erfsfm.common.processes import processes
 from erfsfm.common.progress import Progress
 from erfsfm.data.discovery import discover
-from erfsfm.data.recordings import Recording
 from erfsfm.inference import DepthPosePredictor, has_bfloat16
 from erfsfm.mvs.fusion import CHANGE, CHANNELS, FILE, FULL_SIZE, STEP, DepthFusion
 from erfsfm.networks.torch_network import exported
@@ -204,9 +203,7 @@ def _drawn(
 
 
 def _chunk(roots: Sequence[Path], weights: str, seed: int) -> list[Sample]:
-    recordings: list[Recording] = []
-    for root in roots:
-        recordings += discover(root)
+    recordings = [recording for root in roots for recording in discover(root)]
     source = FusionSamples(
         recordings, DepthPosePredictor.from_weights(weights, runtime="onnx"), seed
     )

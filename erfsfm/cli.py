@@ -47,6 +47,7 @@ Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a tabl
 Fidelity = Annotated[
     Literal["default", "paper"], typer.Option(help="paper: exactly as the reference code")
 ]
+AllowLeak = Annotated[bool, typer.Option("--allow-leak", help="evaluate frames seen in training")]
 
 
 @app.command()
@@ -201,9 +202,7 @@ def evaluate_depth(
         ),
     ] = None,
     fidelity: Fidelity = "default",
-    allow_leak: Annotated[
-        bool, typer.Option("--allow-leak", help="evaluate frames seen in training")
-    ] = False,
+    allow_leak: AllowLeak = False,
     pictures: Annotated[
         Path | None,
         typer.Option(help="folder that receives a picture of each street: image, depths and truth"),
@@ -306,9 +305,7 @@ def evaluate_pose(
     ],
     weights: Weights = "default",
     fidelity: Fidelity = "default",
-    allow_leak: Annotated[
-        bool, typer.Option("--allow-leak", help="evaluate frames seen in training")
-    ] = False,
+    allow_leak: AllowLeak = False,
     device: Device = "auto",
     seed: UnusedSeed = 0,
     as_json: Json = False,
@@ -396,8 +393,7 @@ def networks(
 
     summaries = describe(fidelity, width, sources)
     if as_json:
-        typer.echo(json.dumps(summaries, indent=2))
-        return
+        return print_rows(summaries, as_json)
     rows = []
     for row in summaries:
         work = (
@@ -468,8 +464,7 @@ def receptive_field(
     output.parent.mkdir(parents=True, exist_ok=True)
     draw_fields(rows, snippet[2], output)
     if as_json:
-        typer.echo(json.dumps([row.summary for row in rows], indent=2))
-        return
+        return print_rows([row.summary for row in rows], as_json)
     field_table(rows).print()
     typer.echo(f"picture in {output}")
 
@@ -532,10 +527,7 @@ def export(
 
     files = export_onnx(load_model(weights), output, seed)
     if as_json:
-        typer.echo(
-            json.dumps([asdict(file) | {"path": str(file.path)} for file in files], indent=2)
-        )
-        return
+        return print_rows([asdict(file) | {"path": str(file.path)} for file in files], as_json)
     for file in files:
         typer.echo(
             f"{file.kind}: {file.preset} in {file.path}; differs from PyTorch by {file.difference:.1e}"

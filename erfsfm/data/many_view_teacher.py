@@ -45,7 +45,7 @@ LEAST_NEIGHBOURS = 2
 _FPS = 10.0
 _CAMERA_HEIGHT_M = 1.65  # any: poses are given in camera heights
 _TRAJECTORY = "trajectory_optimised.kitti.txt"
-_SETTINGS = ("mapping.enabled=false", "output.report=false")
+_RUN = "--device cpu --set mapping.enabled=false --set output.report=false"
 _CHUNK = 8  # labels of one task
 _DIGITS = 32  # of a digest
 
@@ -140,20 +140,8 @@ class DriveLabels:
                     )
             camera = asdict(recording.camera) | {"fps": _FPS, "camera_height_m": _CAMERA_HEIGHT_M}
             (drive / "camera.yaml").write_text(yaml.safe_dump(camera))
-            words = [
-                "run",
-                "--dataset",
-                str(drive),
-                "--output",
-                str(output),
-                "--weights",
-                weights,
-                "--device",
-                "cpu",
-            ]
-            for setting in _SETTINGS:
-                words += ["--set", setting]
-            reason = slam_process(words)
+            where = "--dataset", str(drive), "--output", str(output)
+            reason = slam_process(["run", *where, "--weights", weights, *_RUN.split()])
             if reason or not (output / _TRAJECTORY).is_file():
                 raise TrainingError(
                     f"the teacher's poses of {name} could not be found: {reason or 'it wrote none'}"
@@ -374,9 +362,10 @@ class ManyViewTeacher:
                     progress("teacher: depth", drive.measure_labels(chunk), total)
             elif tasks:
                 with processes("measures labels") as pool:
-                    running = []
-                    for drive, chunk in tasks:
-                        running.append(pool.submit(drive.measure_labels, chunk, self._learned))
+                    running = [
+                        pool.submit(drive.measure_labels, chunk, self._learned)
+                        for drive, chunk in tasks
+                    ]
                     for future in as_completed(running):
                         done += future.result()
                         progress("teacher: depth", done, total)

@@ -24,6 +24,7 @@ from erfsfm.geometry import Camera
 
 logger = logging.getLogger(__name__)
 
+_LEAST_DETERMINANT = 0.5  # of what a file has for rotations
 _WHITE = 250  # grey levels of a resized mask: black ones spread into their neighbours
 _kept: dict[
     Path, Image
@@ -187,9 +188,11 @@ class Recording:
                 raise ValueError(
                     f"it has {numbers.shape[1]} columns, or a number that is not finite"
                 )
+            rows = numbers.reshape(-1, 3, 4)
+            if (np.linalg.det(rows[..., :3]) < _LEAST_DETERMINANT).any():
+                raise ValueError("its columns 1-3, 5-7 and 9-11 are no rotation")
         except (OSError, ValueError) as error:
             raise DataError(f"{self.poses_file} must hold 12 numbers a row: {error}") from error
-        rows = numbers.reshape(-1, 3, 4)
         first = self.skipped if len(rows) == self.stored else self.start
         rows = rows[first : first + len(self)]
         if len(rows) < len(self):

@@ -75,8 +75,7 @@ class Split(Section):
             for run in filter(None, runs):
                 first = int(run["first"])
                 numbers = range(first, int(run["stop"] or first + 1), int(run["step"] or 1))
-                for number in numbers:
-                    frames.append((match["recording"], number))
+                frames += [(match["recording"], number) for number in numbers]
         return frames
 
 
@@ -141,9 +140,7 @@ def split_recordings(
         )
     split = read_split_file(config.split) if config.split else Split()
     division = _Division(config, split)
-    found: list[Recording] = []
-    for root in config.roots:
-        found += discover(root, camera)
+    found = [each for root in config.roots for each in discover(root, camera)]
     if camera is not None and not any(each.name.startswith("folder/") for each in found):
         raise DataError(f"--camera {camera} is for images and videos of your own: leave it out")
     division.require_found(found)

@@ -45,11 +45,8 @@ CAP_HEIGHTS = 50.0  # camera heights: some 80 m from a car's roof
 LARGEST_RATIO = 1.3  # of the bounds of a pixel's depth; wider ones are no truth
 SLAM_WEIGHTS = "default"
 TRUTH_FOLDER = "truth"
-_RUN = (
-    "loops.enabled=false",
-    "mapping.keyframe_distance_m=0.3",
-    "output.report=false",
-)  # all frames
+# all frames
+_RUN = "--set loops.enabled=false --set mapping.keyframe_distance_m=0.3 --set output.report=false"
 _RATIOS = ("abs_rel", "rmse_log", "a1", "a2", "a3")  # errors without a unit: the scale is fitted
 
 
@@ -78,9 +75,7 @@ def depth_protocol(
     Raises:
         DataError: no true depth under a root, or a leak that was not allowed.
     """
-    streets: list[Street] = []
-    for root in roots:
-        streets += find_streets(root)
+    streets = [street for root in roots for street in find_streets(root)]
     leaks: dict[str, list[bool]] = {}
     for name, each in networks.items():
         leaks[name] = [refuse_leak(each, street.seen, allow_leak) for street in streets]
@@ -176,9 +171,7 @@ def _depth_of_run(street: Street, part: str, weights: str) -> dict[str, Any] | s
     """``depth`` of ``metrics.json`` of a run against a part of the truth, or why there is none."""
     with tempfile.TemporaryDirectory(prefix="erfsfm-refined-") as temporary:
         output = Path(temporary) / "run"
-        words = [*street.drive(Path(temporary), part), "--output", str(output)]
-        for setting in _RUN:
-            words += ["--set", setting]
+        words = [*street.drive(Path(temporary), part), "--output", str(output), *_RUN.split()]
         reason = slam_process(["run", "--weights", weights, *words])
         if reason:
             return reason

@@ -134,9 +134,7 @@ def eigen_protocol(
         by_motion = compare(guess, truth, scaling=scale) if scale is not None else None
         if by_motion is not None:
             errors["pose"].append(by_motion)
-    rows = []
-    for scaling, compared in errors.items():
-        rows.append(_row("networks", scaling, compared, len(frames), leak))
+    rows = [_row("networks", *compared, len(frames), leak) for compared in errors.items()]
     return [*rows, _row("flat road", "gt-median", flat, len(frames), leak=False)]
 
 

@@ -1,4 +1,4 @@
-"""The five-frame snippet protocol for ego-motion (Zhou et al. 2017, section 4.2), in NumPy alone.
+"""The five-frame snippet protocol for ego-motion (Zhou et al. 2017, section 4.2).
 
 Conventions: ``docs/design/conventions.md``. Poses of a snippet are written in the frame of its first camera.
 """
@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 FloatArray = NDArray[np.float64]
 Fidelity = Literal["default", "paper"]
@@ -49,21 +50,12 @@ def snippet_errors(
 
     Args:
         T_first_k_pred: predicted poses ``(S, K, 4, 4)``, any scale.
-        T_first_k_true: true poses ``(S, K, 4, 4)``.
+        T_first_k_true: true poses ``(S, K, 4, 4)``, at least one snippet.
         fidelity: ``paper`` adds the four zero rows that the reference code averages over.
-
-    Raises:
-        ValueError: if the shapes differ or there is no snippet.
     """
     predicted = np.asarray(T_first_k_pred, dtype=np.float64)
     truth = np.asarray(T_first_k_true, dtype=np.float64)
-    if predicted.shape != truth.shape or predicted.ndim != 4 or predicted.shape[2:] != (4, 4):
-        raise ValueError(
-            f"snippets must both have shape (S, K, 4, 4); got {predicted.shape}, {truth.shape}"
-        )
     count, length = predicted.shape[:2]
-    if count == 0 or length < 2:
-        raise ValueError(f"need at least one snippet of two frames; got {count} of {length}")
     p, g = predicted[..., :3, 3], truth[..., :3, 3]
     energy, true_energy = (p**2).sum(axis=(1, 2)), (g**2).sum(axis=(1, 2))
     scale = np.zeros(count)
@@ -72,7 +64,8 @@ def snippet_errors(
     )
     ate = np.sqrt(((g - scale[:, None, None] * p) ** 2).sum(axis=(1, 2))) / length
     R_error = truth[..., :3, :3] @ np.swapaxes(predicted[..., :3, :3], -1, -2)
-    re = rotation_angle(R_error).sum(axis=1) / length
+    angles = Rotation.from_matrix(R_error.reshape(-1, 3, 3)).magnitude()
+    re = angles.reshape(count, length).sum(axis=1) / length
     if fidelity == "paper":
         ate, re = np.pad(ate, (0, _PAPER_ZERO_ROWS)), np.pad(re, (0, _PAPER_ZERO_ROWS))
     return SnippetErrors(
@@ -90,7 +83,7 @@ def snippets_from_trajectory(T_world_camera: FloatArray, length: int = 5) -> Flo
     poses = np.asarray(T_world_camera, dtype=np.float64)
     starts = np.arange(max(len(poses) - length + 1, 0))
     T_world_k = poses[starts[:, None] + np.arange(length)]  # (S, length, 4, 4)
-    return _invert(T_world_k[:, :1]) @ T_world_k
+    return np.linalg.inv(T_world_k[:, :1]) @ T_world_k
 
 
 def snippet_from_network(T_source_target: FloatArray) -> FloatArray:
@@ -105,38 +98,6 @@ def snippet_from_network(T_source_target: FloatArray) -> FloatArray:
         ``T_first_k`` ``(..., N + 1, 4, 4)``.
     """
     sources = np.asarray(T_source_target, dtype=np.float64)
-    if (
-        sources.ndim < 3
-        or sources.shape[-2:] != (4, 4)
-        or sources.shape[-3] % 2
-        or not sources.shape[-3]
-    ):
-        raise ValueError(
-            f"T_source_target must have shape (..., N, 4, 4), N even; got {sources.shape}"
-        )
     T_k_target = np.insert(sources, sources.shape[-3] // 2, np.eye(4), axis=-3)
-    T_first_k: FloatArray = T_k_target[..., :1, :, :] @ _invert(T_k_target)
+    T_first_k: FloatArray = T_k_target[..., :1, :, :] @ np.linalg.inv(T_k_target)
     return T_first_k
-
-
-def rotation_angle(R: FloatArray) -> FloatArray:
-    """Angle in radians of rotations ``(..., 3, 3)``, in [0, pi], accurate at both ends.
-
-    angle = atan2(|vee(R - R^T)|, trace(R) - 1), both twice the sine and cosine
-    """
-    skew = R - np.swapaxes(R, -1, -2)
-    sine = np.linalg.norm(
-        np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1), axis=-1
-    )
-    angle: FloatArray = np.arctan2(sine, np.trace(R, axis1=-2, axis2=-1) - 1.0)
-    return angle
-
-
-def _invert(T_a_b: FloatArray) -> FloatArray:
-    """``T_b_a`` of rigid ``T_a_b``, both ``(..., 4, 4)``."""
-    T_b_a = np.zeros_like(T_a_b)
-    R_b_a = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
-    T_b_a[..., :3, :3] = R_b_a
-    T_b_a[..., :3, 3:] = -R_b_a @ T_a_b[..., :3, 3:]
-    T_b_a[..., 3, 3] = 1.0
-    return T_b_a

@@ -160,8 +160,7 @@ def _of_recordings(root: Path) -> list[Street]:
     frames: list[tuple[Recording, int]] = []
     for recording in recordings:
         known = [index for index, file in enumerate(recording.depth or ()) if file is not None]
-        for index in known[::EVERY]:
-            frames.append((recording, index))
+        frames += [(recording, index) for index in known[::EVERY]]
     truths = [_truth(recording, index) for recording, index in frames]
     if len({truth.shape for truth in truths}) > 1:
         raise DataError(

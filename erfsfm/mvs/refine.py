@@ -79,10 +79,9 @@ def measure(
         T_neighbour_target: ``(N, 4, 4)``; the unit of its translations is that of the depth.
     """
     inverse = (1 / depth).astype(np.float32)
-    views: list[tuple[Appearance, Projection]] = []
-    for other, T in zip(neighbours, T_neighbour_target):
-        views.append((other, Projection(K, T, *depth.shape)))
-    costs = sweep(target.levels, [(other.levels, where) for other, where in views], inverse)
+    where = [Projection(K, T, *depth.shape) for T in T_neighbour_target]
+    views = list(zip(neighbours, where))
+    costs = sweep(target.levels, [(other.levels, at) for other, at in views], inverse)
     coarse = lowest(smoothed(costs, target.grey))
     change = np.asarray(cv2.medianBlur(coarse, 5), np.float32)
     step, information, fit = _gauss_newton(target.levels, views, inverse * np.exp(change))

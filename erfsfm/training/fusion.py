@@ -21,7 +21,6 @@ from erfsfm.common.files import write_atomically
 from erfsfm.common.processes import processes
 from erfsfm.common.progress import Progress
 from erfsfm.data.discovery import discover
-from erfsfm.data.recordings import Recording
 from erfsfm.inference import DepthPosePredictor, has_bfloat16
 from erfsfm.mvs.fusion import CHANGE, CHANNELS, FILE, FULL_SIZE, STEP, DepthFusion
 from erfsfm.networks.torch_network import exported
@@ -204,9 +203,7 @@ def _drawn(
 
 
 def _chunk(roots: Sequence[Path], weights: str, seed: int) -> list[Sample]:
-    recordings: list[Recording] = []
-    for root in roots:
-        recordings += discover(root)
+    recordings = [recording for root in roots for recording in discover(root)]
     source = FusionSamples(
         recordings, DepthPosePredictor.from_weights(weights, runtime="onnx"), seed
     )
@@ -313,19 +310,15 @@ def _fit_sigma(net: FusionNet, data: Sequence[Sample]) -> dict[str, float]:
         evidence, wanted, is_known = _batch(data[first : first + _BATCH])
         change, log_sigma = net(evidence)
         measured = functional.pixel_shuffle(evidence[:, 4 * CHANGE : 4 * CHANGE + 4], 2)[:, 0]
-        for name, found in (
-            ("guess", torch.zeros_like(change)),
-            ("measured", measured),
-            ("fused", change),
-        ):
-            errors[name].append((torch.exp((wanted - found)[is_known]) - 1).abs())
+        for parts, found in zip(errors.values(), (torch.zeros_like(change), measured, change)):
+            parts.append((torch.exp((wanted - found)[is_known]) - 1).abs())
         ratios.append(((wanted - change).abs() * torch.exp(-log_sigma))[is_known])
     every = torch.cat(ratios)[::7]
     factor = torch.quantile(every[: 10**7], _COVERAGE) / _SIGMAS
     assert net.head.bias is not None
     net.head.bias[8:] += torch.log(factor)
-    all_errors = {name: torch.cat(parts) for name, parts in errors.items()}
-    metrics = {f"{name}_mean": float(each.mean()) for name, each in all_errors.items()}
-    for name, each in all_errors.items():
-        metrics[f"{name}_median"] = float(each.median())
+    metrics: dict[str, float] = {}
+    for name, parts in errors.items():
+        each = torch.cat(parts)
+        metrics |= {f"{name}_mean": float(each.mean()), f"{name}_median": float(each.median())}
     return metrics

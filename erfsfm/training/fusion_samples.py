@@ -63,18 +63,15 @@ class FusionSamples:
     def __init__(
         self, recordings: Sequence[Recording], networks: DepthPosePredictor, seed: int
     ) -> None:
-        self._recordings: list[Recording] = []
-        self._poses: list[NDArray[np.float64]] = []
+        self._drives: list[tuple[Recording, NDArray[np.float64]]] = []
         for recording in recordings:
             poses = None if recording.depth is None else recording.true_poses()
             if poses is not None:
-                self._recordings.append(recording)
-                self._poses.append(poses)
-        if not self._recordings:
+                self._drives.append((recording, poses))
+                if _height(recording) < 2 * CROP[0]:
+                    raise TrainingError(f"{recording.name} has flatter images: {_WANTED}")
+        if not self._drives:
             raise TrainingError(f"no drive has depth maps and poses: {_WANTED}")
-        for recording in self._recordings:
-            if _height(recording) < 2 * CROP[0]:
-                raise TrainingError(f"{recording.name} has flatter images: {_WANTED}")
         self._networks, self._rng = networks, np.random.default_rng(seed)
 
     def draw(self) -> Sample:
@@ -84,11 +81,11 @@ class FusionSamples:
             TrainingError: no frame has depth and neighbours.
         """
         for _ in range(_MOST_TRIES):
-            which = int(self._rng.integers(len(self._recordings)))
-            index = int(self._rng.integers(len(self._recordings[which])))
-            truth = self._recordings[which].true_depth(index)
+            recording, T_world_camera = self._drives[int(self._rng.integers(len(self._drives)))]
+            index = int(self._rng.integers(len(recording)))
+            truth = recording.true_depth(index)
             if truth is not None and (truth > 0).mean() > _LEAST_KNOWN:
-                drawn = self._sample(self._recordings[which], self._poses[which], index, truth)
+                drawn = self._sample(recording, T_world_camera, index, truth)
                 if drawn is not None:
                     return drawn
         raise TrainingError(f"no frame has dense depth and others at a useful distance: {_WANTED}")
@@ -97,10 +94,10 @@ class FusionSamples:
         self, recording: Recording, T_world_camera: NDArray[np.float64], index: int, truth: Array
     ) -> Sample | None:
         rng = self._rng
-        camera = recording.camera
         height = _height(recording)
-        size = (WIDTH, height)
-        truth = np.asarray(cv2.resize(truth, size, interpolation=cv2.INTER_NEAREST_EXACT))
+        truth = np.asarray(
+            cv2.resize(truth, (WIDTH, height), interpolation=cv2.INTER_NEAREST_EXACT)
+        )
         baselines = np.multiply(
             _BASELINES, np.exp(rng.normal(0, _BASELINE_SPREAD, len(_BASELINES)))
         )
@@ -121,7 +118,7 @@ class FusionSamples:
             )
             T[:3, :3] = T[:3, :3] @ turn
             T[:3, 3] = aside @ T[:3, 3] * (1 + rng.normal(0, _LENGTH_ERROR))
-        K = camera.resized(WIDTH, height).K.astype(np.float64)
+        K = recording.camera.resized(WIDTH, height).K.astype(np.float64)
         channels = evidence(measure(target, guess, others, K, T_neighbour_target))
         is_known = truth > 0
         wanted = np.log(guess / np.where(is_known, truth, FARTHEST_M))

@@ -177,6 +177,12 @@ def test_a_root_without_recordings(tmp_path: Path, content: list[str]) -> None:
     assert "no recording" in refusal(tmp_path)
 
 
+def test_poses_that_are_no_rotations(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path, frames=1)
+    (tmp_path / "poses/00.txt").write_text("0 0 0 0 0 0 0 0 0 0 0 0\n")
+    assert "no rotation" in refusal(tmp_path)
+
+
 def test_a_recording_is_split_at_its_gaps(
     tmp_path: Path, write_root: Callable[..., Path], caplog: pytest.LogCaptureFixture
 ) -> None:

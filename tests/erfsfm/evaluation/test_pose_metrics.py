@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from erfsfm.evaluation.pose_metrics import (
     SnippetErrors,
-    rotation_angle,
     snippet_errors,
     snippet_from_network,
     snippets_from_trajectory,
@@ -104,13 +103,6 @@ def test_network_output_becomes_the_snippet_of_the_trajectory() -> None:
     T_first_k = snippet_from_network(T_source_target)
     np.testing.assert_allclose(T_first_k, snippets_from_trajectory(T_world_camera)[0], atol=1e-13)
     np.testing.assert_allclose(snippet_from_network(np.stack([T_source_target] * 2))[1], T_first_k)
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-8, 1e-3, 1.0, math.pi - 1e-6, math.pi])
-def test_rotation_angle_is_accurate_at_both_ends(angle: float) -> None:
-    axis = np.array([1.0, -2.0, 2.0]) / 3.0
-    R = Rotation.from_rotvec(angle * axis).as_matrix()
-    assert float(rotation_angle(R)) == pytest.approx(angle, rel=1e-12, abs=1e-15)
 
 
 def printed(errors: SnippetErrors) -> tuple[float, float, float]:

@@ -209,9 +209,7 @@ class VisualOdometry:
             if two_view is None or two_view.inliers.sum() < MIN_INLIERS:
                 return None
             sigmas = np.sqrt(np.diag(two_view.covariance)[:3])
-            return RelativeRotation(
-                (first.index, last.index), two_view.unit_pose.R_current_previous, sigmas
-            )
+            return RelativeRotation(two_view.unit_pose.R_current_previous, sigmas)
 
         return measure
 

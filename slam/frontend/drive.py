@@ -106,9 +106,7 @@ class Drive:
 
 
 def find_cuts(
-    failures: Sequence[tuple[int, int, float]],
-    measured: Collection[Ends],
-    doubtful: Collection[int],
+    failures: Mapping[Ends, float], measured: Collection[Ends], doubtful: Collection[int]
 ) -> list[int]:
     """Frames that show another place than the frame before: their step failed, the steps before and after did not.
 
@@ -120,7 +118,7 @@ def find_cuts(
     """
     ends = set(measured)
     cuts = []
-    for first, last, found in failures:
+    for (first, last), found in failures.items():
         around = {first - 1, first, last, last + 1}
         alone = last == first + 1 and {(first - 1, first), (last, last + 1)} <= ends
         if found < _LEAST_FOUND and alone and around.isdisjoint(doubtful):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Reversible, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from itertools import takewhile
@@ -115,8 +115,8 @@ class Measured:
     snippets: list[SnippetPoses] = field(default_factory=list)
     motions: list[Motion] = field(default_factory=list)
     road_steps: dict[Ends, RoadStep] = field(default_factory=dict)
-    relative_rotations: list[RelativeRotation] = field(default_factory=list)
-    failures: list[tuple[int, int, float]] = field(default_factory=list)
+    relative_rotations: dict[Ends, RelativeRotation] = field(default_factory=dict)
+    failures: dict[Ends, float] = field(default_factory=dict)
     roads: list[float | Failed] = field(default_factory=list)
     views: list[View] = field(default_factory=list)
     keyframes: list[Keyframe] = field(default_factory=list)
@@ -171,32 +171,32 @@ class Measured:
         It takes as long as there are frames since, however long the drive.
         """
 
-        def last(items: Iterable[T], start: Callable[[T], int]) -> list[T]:
+        def last(items: Reversible[T], start: Callable[[T], int]) -> list[T]:
             """The items that begin in the window, of items in order of time that may span a few frames."""
-            return list(takewhile(lambda item: start(item) >= first, items))[::-1]
+            return list(takewhile(lambda item: start(item) >= first, reversed(items)))[::-1]
 
-        def renumbered(ends: Ends) -> Ends:
-            return ends[0] - first, ends[1] - first
+        def within(items: dict[Ends, T]) -> dict[Ends, T]:
+            """The same of what was measured between two frames, which are renumbered."""
+            kept = last(items, lambda ends: ends[0])
+            return {(ends[0] - first, ends[1] - first): items[ends] for ends in kept}
 
-        window = Measured(roads=self.roads[first:], below_is_nearer=self.below_is_nearer)
-        for snippet in last(reversed(self.snippets), lambda snippet: min(snippet.sources)):
+        window = Measured(
+            road_steps=within(self.road_steps),
+            relative_rotations=within(self.relative_rotations),
+            failures=within(self.failures),
+            roads=self.roads[first:],
+            unusable={k - first: why for k, why in self.unusable.items() if k >= first},
+            repeated=[k - first for k in self.repeated if k >= first],
+            below_is_nearer=self.below_is_nearer,
+        )
+        for snippet in last(self.snippets, lambda snippet: min(snippet.sources)):
             target = snippet.target - first
             sources = tuple(source - first for source in snippet.sources)
             window.snippets.append(replace(snippet, target=target, sources=sources))
-        for motion in last(reversed(self.motions), lambda motion: motion.ends[0]):
-            from_index, to_index = renumbered(motion.ends)
+        for motion in last(self.motions, lambda motion: motion.ends[0]):
+            from_index, to_index = (k - first for k in motion.ends)
             pose = replace(motion.relative_pose, from_index=from_index, to_index=to_index)
             window.motions.append(replace(motion, relative_pose=pose))
-        for ends, step in last(reversed(self.road_steps.items()), lambda item: item[0][0]):
-            window.road_steps[renumbered(ends)] = step
-        for turn in last(reversed(self.relative_rotations), lambda turn: turn.ends[0]):
-            window.relative_rotations.append(replace(turn, ends=renumbered(turn.ends)))
-        for earlier, later, found in last(reversed(self.failures), lambda failure: failure[0]):
-            window.failures.append((*renumbered((earlier, later)), found))
-        for frame, why in last(reversed(self.unusable.items()), lambda item: item[0]):
-            window.unusable[frame - first] = why
-        for frame in last(reversed(self.repeated), lambda frame: frame):
-            window.repeated.append(frame - first)
         return window
 
 

@@ -31,7 +31,7 @@ _OUTLIER_SIGMAS = 3.0
 _BLOCK = np.arange(9)
 
 
-def smooth_rotations(steps: Steps, relative_rotations: Sequence[RelativeRotation]) -> Steps:
+def smooth_rotations(steps: Steps, relative_rotations: Mapping[Ends, RelativeRotation]) -> Steps:
     """The steps with rotations fitted robustly to single steps and relative rotations, directions corrected alike.
 
     Least squares over one small rotation for each triangulated step, in its current camera. The
@@ -41,8 +41,8 @@ def smooth_rotations(steps: Steps, relative_rotations: Sequence[RelativeRotation
     motions = triangulated(steps)
     by_start = shortest_by_start(motions)
     usable = []
-    for rotation in relative_rotations:
-        path = path_between(by_start, *rotation.ends)
+    for ends, rotation in relative_rotations.items():
+        path = path_between(by_start, *ends)
         if path:
             usable.append((rotation, path))
     if not usable:

@@ -94,7 +94,6 @@ class RelativeRotation:
     ``sigmas`` ``(3,)`` are those of its rotation vector in the later camera, radians.
     """
 
-    ends: Ends
     R_to_from: FloatArray
     sigmas: FloatArray
 

@@ -4,7 +4,7 @@ As in DF-VO (Zhan et al. 2020): an essential matrix where the parallax determine
 from the ratio of learned to triangulated depth; perspective-n-point against learned depth where it
 does not.
 
-Learned depth, the dynamic mask and the motion prior are learned from the steps before: one wrong
+The error of learned depth and the motion prior are learned from the steps before: one wrong
 step teaches them to find the next one wrong too. So a step that loses a third of its inliers, or
 has a length that no car reaches, is estimated again from corners alone, and the road, the steps
 before and a car's acceleration vote between both.
@@ -37,7 +37,6 @@ from slam.frontend.visual.two_view import (
     CORNER_CORRELATION,
     DEPTH_RELATIVE_SIGMA,
     INLIER_PX,
-    DynamicMask,
     Matches,
     TwoViewEstimate,
     estimate,
@@ -115,7 +114,6 @@ class VisualOdometry:
         self._tracker = CornerTracker()
         self.depth_error, self.corners = DepthError(), CornerRecord()
         self.below_is_nearer: list[bool] = []
-        self._dynamic_mask = DynamicMask.empty(intrinsics.width, intrinsics.height)
         self._history = MotionHistory()
         self.found = 1.0
         self._height: float | None = None  # the last one that was known
@@ -194,7 +192,7 @@ class VisualOdometry:
         if flow is None:
             return lambda: None
         find = self._tracker.track_across(first, last, flow)
-        mask, error = self._dynamic_mask, self.depth_error
+        error = self.depth_error
 
         def measure() -> RelativeRotation | None:
             tracks = find()
@@ -204,14 +202,12 @@ class VisualOdometry:
                 np.ones(len(tracks), dtype=bool),
                 nearest_depth(depth_first_unscaled, tracks.previous),
             )
-            matches = self._matches(tracks, votes, learned, None, mask, error)
+            matches = self._matches(tracks, votes, learned, None, error)
             two_view = refined(matches, flow.unit_pose)
             if two_view is None or two_view.inliers.sum() < MIN_INLIERS:
                 return None
             sigmas = np.sqrt(np.diag(two_view.covariance)[:3])
-            return RelativeRotation(
-                (first.index, last.index), two_view.unit_pose.R_current_previous, sigmas
-            )
+            return RelativeRotation(two_view.unit_pose.R_current_previous, sigmas)
 
         return measure
 
@@ -221,7 +217,6 @@ class VisualOdometry:
         votes: BoolArray,
         learned: FloatArray,
         height: float | None,
-        mask: DynamicMask,
         error: DepthError,
     ) -> Matches:
         rays_previous, rays_current = (
@@ -235,8 +230,8 @@ class VisualOdometry:
         on_road = np.zeros(len(tracks), dtype=bool)
         if height is not None:
             on_road = np.abs(rays_previous[:, 1] * depth / height - 1.0) < _ROAD_TOLERANCE
-        weights, focal_px = mask.weights(tracks.previous), self._intrinsics.fx
-        return Matches(rays_previous, rays_current, depth, sigma, on_road, weights, votes, focal_px)
+        focal_px = self._intrinsics.fx
+        return Matches(rays_previous, rays_current, depth, sigma, on_road, votes, focal_px)
 
     def _still(
         self, ends: Ends, seconds: float, tracks: Tracks, votes: BoolArray, depth: FloatArray
@@ -273,9 +268,7 @@ class VisualOdometry:
         height: float | None,
     ) -> Motion | Failed | None:
         """Rotation and direction from the essential matrix, None where it is not well conditioned."""
-        matches = self._matches(
-            tracks, votes, learned, height, self._dynamic_mask, self.depth_error
-        )
+        matches = self._matches(tracks, votes, learned, height, self.depth_error)
         rays_previous, rays_current = matches.rays_previous[votes], matches.rays_current[votes]
         ends = frames[0].index, frames[1].index
         # the translation of an essential matrix is arbitrary under pure rotation: only used with
@@ -300,7 +293,7 @@ class VisualOdometry:
         chosen = usual
         is_possible = history.is_possible_speed(usual.speed(height, seconds), seconds)
         if history.is_sudden_loss(usual.inlier_ratio) or is_possible is False:
-            # what depth, mask and history say may be what is wrong
+            # what depth and history say may be what is wrong
             alone = step(matches.by_geometry_alone(), MotionHistory())
             credible = most_credible([usual, alone], matches, height, seconds, history)
             if credible is None:
@@ -318,24 +311,23 @@ class VisualOdometry:
     def _learn(
         self, tracks: Tracks, matches: Matches, learned: FloatArray, step: Step, speed: float
     ) -> None:
-        """Learn from a trusted step where objects move, how the camera moves, and the error of learned depth."""
+        """Learn from a trusted step how the camera moves, and the error of learned depth."""
         two_view = step.two_view
-        still = two_view.inliers & (matches.weights > 0.5)
+        still = two_view.inliers
         rays = matches.rays_previous[still], matches.rays_current[still]
         nearness, per_ray = triangulated_nearness(*rays, two_view.unit_pose)
         above, below = (nearness[side * rays[0][:, 1] > _NEAR_SLOPE] for side in (-1, 1))
         if min(len(above), len(below)) >= _MIN_RATIOS:
             self.below_is_nearer.append(bool(np.median(below) > np.median(above)))
         sigma = two_view.noise_px / self._intrinsics.fx * per_ray
-        self._dynamic_mask = self._dynamic_mask.updated(tracks.current, two_view.inliers)
         self._history = self._history.with_step(two_view.unit_pose, step.inlier_ratio, speed)
         length = step.motion.length_unscaled
         self.depth_error = self.depth_error.with_step(learned[still], nearness, sigma, length)
         image = rays[1][:, :2] * self._intrinsics.focal_half_widths
-        if self.corners.is_far(tracks.track_ids[still], image):
-            self.corners.keep(tracks.track_ids[still], image)
+        self._fitted = tracks.track_ids[still]
+        if self.corners.is_far(self._fitted, image):
+            self.corners.keep(self._fitted, image)
         self._points = step.motion.ends[1], step.points
-        self._fitted = tracks.track_ids[two_view.inliers]
 
     def _triangulated(
         self,

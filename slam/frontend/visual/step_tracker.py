@@ -72,7 +72,7 @@ class StepTracker:
             step = Failed(NO_POSE)
         if isinstance(step, Failed):
             ends = recent[-1].index, current.index
-            self._measured.failures.append((*ends, self.odometry.found))
+            self._measured.failures[ends] = self.odometry.found
             logger.info("geometry %d -> %d failed: %s", *ends, step.reason)
             return []
         self._measured.motions.append(step)
@@ -128,7 +128,8 @@ class StepTracker:
         T_first_current = chain(T_previous_next)[-1]
         depth = self._seen(first)[1]
         rotation = self.odometry.relative_rotation(first, current, depth, T_first_current)
-        return [("geometry", rotation, self._measured.relative_rotations.append)]
+        keep = partial(self._measured.relative_rotations.__setitem__, (first.index, current.index))
+        return [("geometry", rotation, keep)]
 
     def _keep_road(self, ends: Ends, step: RoadStep | Failed) -> None:
         if isinstance(step, RoadStep):

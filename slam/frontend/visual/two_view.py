@@ -2,8 +2,7 @@
 
 Corners alone are ambiguous (``docs/design/visual-front-end.md``). Two further measurements resolve
 this: the shift of each corner along its epipolar line, which learned depth predicts too; and the
-usual direction of motion. Residuals of corners are across and along these lines. Where many corners
-were outliers recently, the others are weighted down.
+usual direction of motion. Residuals of corners are across and along these lines.
 
 A car that drives along keeps its corners on their epipolar lines. Learned depth is believed against
 them only about a region as an object has it: connected, of one motion, and without the majority of
@@ -17,7 +16,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Self
 
 import cv2
 import numpy as np
@@ -32,14 +30,13 @@ from slam.geometry.multiview import (
     unit_pose_by_pnp,
 )
 from slam.geometry.robust import mad_sigma, weighted_median
-from slam.geometry.se3 import BoolArray, FloatArray, IntArray, compose, rotation_matrix
+from slam.geometry.se3 import BoolArray, FloatArray, compose, rotation_matrix
 
 _ITERATIONS = 10
 # over-relaxation: reweighting alone converges by half of the distance an iteration
 _OVERSTEP = 1.4
 _CONVERGED = 3e-5  # radians: the least sigma of a rotation
 _LEAST_POINTS = 8
-_LEAST_PROPOSING_WEIGHT = 0.2
 _RESECTION_PX = 2.0
 # corners of a motion over those of the best one, from which on it may be the right one
 _COMPARABLE_SUPPORT = 0.6
@@ -64,14 +61,6 @@ _HATS = np.array(
     [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]],
     float,
 )
-_CELL_PX = 8.0
-_SPREAD_CELLS = 1.5
-# power of a cell's inlier ratio over that of the whole image, by which corners weigh
-_SHARPNESS = 4.0
-# decay a step: a half-life of seven steps
-_KEPT = 0.9
-# weight, in corners, of the prior that a cell has the inlier ratio of the whole image
-_PRIOR_CORNERS = 0.5
 # side of the cells that connect corners to a region, pixels: some two spacings of corners
 _REGION_CELL_PX = 24.0
 _LARGEST_SHARE = 0.5
@@ -84,9 +73,8 @@ class Matches:
     """``M`` corners in two images: rays ``(M, 3)`` with z = 1 in both, learned ``depth_previous`` ``(M,)`` or NaN.
 
     Learned depth is without its bias and has the relative ``depth_sigma`` ``(M,)``; by it the
-    corners ``on_road`` ``(M,)`` lie at the height of the road. ``weights`` ``(M,)`` in (0, 1] are
-    lower on dynamic objects. The motion that most of those with ``votes`` ``(M,)`` agree on is
-    chosen. ``focal_px`` is the focal length, pixels.
+    corners ``on_road`` ``(M,)`` lie at the height of the road. The motion that most of those with
+    ``votes`` ``(M,)`` agree on is chosen. ``focal_px`` is the focal length, pixels.
     """
 
     rays_previous: FloatArray
@@ -94,14 +82,13 @@ class Matches:
     depth_previous: FloatArray
     depth_sigma: FloatArray
     on_road: BoolArray
-    weights: FloatArray
     votes: BoolArray
     focal_px: float
 
     def by_geometry_alone(self) -> Matches:
         """The same corners without what learned depth and the steps before say of them."""
-        everyone = np.ones(len(self.weights))
-        return replace(self, depth_previous=np.nan * everyone, weights=everyone, votes=everyone > 0)
+        everyone = np.ones(len(self.votes), np.bool_)
+        return replace(self, depth_previous=np.full(len(everyone), np.nan), votes=everyone)
 
     @cached_property
     def residuals(self) -> Residuals:
@@ -161,9 +148,8 @@ def estimate(matches: Matches, history: MotionHistory, seed: int = 0) -> TwoView
     usual = _refined(matches, history.last, prior)
     if usual is not None and usual.agreeing[votes].mean() >= least:
         return usual
-    reliable = votes & (matches.weights >= _LEAST_PROPOSING_WEIGHT)
-    first, second = matches.rays_previous[reliable], matches.rays_current[reliable]
-    depth = matches.depth_previous[reliable]
+    first, second = matches.rays_previous[votes], matches.rays_current[votes]
+    depth = matches.depth_previous[votes]
     tolerance = _RESECTION_PX / matches.focal_px
     by_points = cache(lambda: unit_pose_by_pnp(first, second, depth, tolerance, seed))
     proposed = unit_pose_by_essential(first, second, INLIER_PX / matches.focal_px, seed)
@@ -216,7 +202,7 @@ def _refined(
         agreeing, inliers = _inliers(matches, near, shift_px, seen_px, _PARALLAX_SIGMAS * sigma)
         if inliers.sum() < _LEAST_POINTS:
             return None
-        weights = inliers * matches.weights / (1.0 + (across / (2.0 * sigma)) ** 2)
+        weights = inliers / (1.0 + (across / (2.0 * sigma)) ** 2)
         weights_along = (
             known * weights / (sigma_along**2 * (1.0 + (along / (2.0 * sigma_along)) ** 2))
         )
@@ -375,44 +361,6 @@ def tangent_of(direction: FloatArray) -> FloatArray:
     a = -1.0 / (sign + z)
     b = x * y * a
     return np.array([[1.0 + sign * x * x * a, b], [sign * b, sign + y * y * a], [-sign * x, -y]])
-
-
-@dataclass(frozen=True)
-class DynamicMask:
-    """Inliers and all corners of the last steps by cell of the image ``(h, w)``, decayed exponentially."""
-
-    inliers: FloatArray
-    corners: FloatArray
-
-    @classmethod
-    def empty(cls, width: int, height: int) -> Self:
-        """A mask without observations for images of ``width`` x ``height`` pixels."""
-        shape = int(np.ceil(height / _CELL_PX)), int(np.ceil(width / _CELL_PX))
-        return cls(np.zeros(shape), np.zeros(shape))
-
-    def weights(self, pixels: FloatArray) -> FloatArray:
-        """Weights in (0, 1] ``(M,)`` of corners at ``pixels`` ``(M, 2)``."""
-        if self.corners.sum() < 1.0:
-            return np.ones(len(pixels))
-        usual = self.inliers.sum() / self.corners.sum()
-        inliers, corners = (
-            cv2.GaussianBlur(kind, (0, 0), _SPREAD_CELLS) for kind in (self.inliers, self.corners)
-        )
-        ratio = (inliers + _PRIOR_CORNERS * usual) / (corners + _PRIOR_CORNERS)
-        return np.minimum(ratio[self._cells(pixels)] / max(usual, 1e-3), 1.0) ** _SHARPNESS
-
-    def updated(self, pixels: FloatArray, is_inlier: BoolArray) -> Self:
-        """The mask after one more step, whose corners now lie at ``pixels`` ``(M, 2)``."""
-        inliers, corners = _KEPT * self.inliers, _KEPT * self.corners
-        cells = self._cells(pixels)
-        np.add.at(corners, cells, 1.0)
-        np.add.at(inliers, cells, is_inlier.astype(float))
-        return type(self)(inliers, corners)
-
-    def _cells(self, pixels: FloatArray) -> tuple[IntArray, IntArray]:
-        column, row = (np.floor(pixels.T / _CELL_PX)).astype(np.int64)
-        height, width = self.corners.shape
-        return np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
 
 
 def moving_corners(

@@ -9,12 +9,12 @@ STEPS = [(k, k + 1) for k in range(9)]
 
 def test_a_single_failed_step_between_measured_ones_is_a_cut() -> None:
     measured = [ends for ends in STEPS if ends != (4, 5)]
-    assert find_cuts([(4, 5, 0.02)], measured, ()) == [5]
-    assert find_cuts([(4, 5, 0.02)], measured, {5}) == [], "the image is unusable"
+    assert find_cuts({(4, 5): 0.02}, measured, ()) == [5]
+    assert find_cuts({(4, 5): 0.02}, measured, {5}) == [], "the image is unusable"
     two = [ends for ends in measured if ends != (5, 6)]
-    assert find_cuts([(4, 5, 0.0), (5, 6, 0.0)], two, ()) == [], "one bad image fails two steps"
-    assert find_cuts([(3, 5, 0.0)], measured, ()) == []
-    assert find_cuts([(4, 5, 0.5)], measured, ()) == [], "half of the image is another car"
+    assert find_cuts({(4, 5): 0.0, (5, 6): 0.0}, two, ()) == [], "one bad image fails two steps"
+    assert find_cuts({(3, 5): 0.0}, measured, ()) == []
+    assert find_cuts({(4, 5): 0.5}, measured, ()) == [], "half of the image is another car"
 
 
 def test_segments_begin_at_cuts_and_after_long_gaps_that_no_map_of_keyframes_relates() -> None:

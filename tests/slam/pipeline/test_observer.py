@@ -298,7 +298,7 @@ def assert_same(one: Observer, other: Observer) -> None:
     assert len(first.relative_rotations) > 8 and len(first.road_steps) > 5 and len(first.steps) > 10
     assert first.road_steps.keys() == second.road_steps.keys()
     for measured in (
-        lambda o: [rotation.R_to_from for rotation in o.relative_rotations],
+        lambda o: [rotation.R_to_from for rotation in o.relative_rotations.values()],
         lambda o: [motion.relative_pose.T_from_to for motion in o.motions],
         lambda o: [motion.relative_pose.sigmas for motion in o.motions],
         lambda o: [snippet.T_source_target for snippet in o.snippets],

@@ -235,7 +235,6 @@ def test_a_rotation_across_two_steps_is_measured_in_its_two_images(texture):
     ]
     first, last = frames[0], frames[2]
     across = odometry.relative_rotation(first[0], last[0], first[1], steps[0] @ steps[1])()
-    assert across.ends == (0, 2)
     R_last_first = poses[2][:3, :3].T @ poses[0][:3, :3]
     assert np.rad2deg(se3.rotation_angle(across.R_to_from.T @ R_last_first)) < 0.02
     assert (np.rad2deg(across.sigmas) < 0.05).all()

@@ -19,7 +19,6 @@ from slam.frontend.visual.odometry import VisualOdometry
 from slam.frontend.visual.two_view import (
     DEPTH_RELATIVE_SIGMA,
     INLIER_PX,
-    DynamicMask,
     Matches,
     Residuals,
     TwoViewEstimate,
@@ -58,7 +57,7 @@ def matches_of(previous: np.ndarray, current: np.ndarray, learned: np.ndarray) -
     count = len(learned)
     sigma = np.full(count, DEPTH_RELATIVE_SIGMA)
     road, everyone = np.zeros(count, bool), np.ones(count, bool)
-    return Matches(previous, current, learned, sigma, road, np.ones(count), everyone, FOCAL_PX)
+    return Matches(previous, current, learned, sigma, road, everyone, FOCAL_PX)
 
 
 def corner_with_a_car(
@@ -122,18 +121,6 @@ def test_a_wrong_unit_and_unknown_depths_do_not_matter():
     learned[::7] = np.nan
     other = estimated(replace(matches, depth_previous=learned))
     assert angle_deg(other.unit_pose.R_current_previous, T_current_previous[:3, :3]) < 0.5
-
-
-def test_corners_of_low_weight_do_not_change_the_motion():
-    """Most depths are unknown here, so that only weights separate the car's corners from the scene's."""
-    for seed in range(6):
-        matches, T_current_previous = corner_with_a_car(seed)
-        weights = np.where(np.arange(len(matches.weights)) < CAR, 0.001, 1.0)
-        blind = replace(matches, depth_previous=np.full(len(weights), np.nan))
-        blind.depth_previous[CAR::4] = matches.depth_previous[CAR::4]
-        unweighted, weighted = estimated(blind), estimated(replace(blind, weights=weights))
-        assert angle_deg(unweighted.unit_pose.R_current_previous, T_current_previous[:3, :3]) > 1.0
-        assert angle_deg(weighted.unit_pose.R_current_previous, T_current_previous[:3, :3]) < 0.3
 
 
 def test_a_known_motion_is_refined():
@@ -356,45 +343,3 @@ def test_corners_that_contradict_each_other_do_not_move() -> None:
     seen[OF_CAR] = EXPECTED[OF_CAR] * np.resize([0.3, 1.7], len(MOVING_CAR))
     moving = moving_corners(PIXELS, np.zeros(len(PIXELS), bool), ~OF_CAR, OF_CAR, EXPECTED, seen)
     assert not moving.any()
-
-
-PLACE = np.array([300.0, 70.0])  # of a car
-
-
-def mask_with_car(steps: int) -> tuple[DynamicMask, np.ndarray]:
-    """One in five corners near ``PLACE`` are inliers, nine in ten of the static scene (their pixels are returned)."""
-    dynamic_mask = DynamicMask.empty(416, 128)
-    static = RNG.uniform([0.0, 0.0], [240.0, 127.0], (150, 2))
-    for _ in range(steps):
-        car = PLACE + RNG.uniform(-12.0, 12.0, (15, 2))
-        is_inlier = np.concatenate([RNG.random(150) < 0.9, RNG.random(15) < 0.2])
-        dynamic_mask = dynamic_mask.updated(np.concatenate([static, car]), is_inlier)
-    return dynamic_mask, static
-
-
-def test_corners_on_a_moving_car_are_weighted_down() -> None:
-    dynamic_mask, static = mask_with_car(8)
-    assert dynamic_mask.weights(PLACE[None]) < 0.05
-    assert np.median(dynamic_mask.weights(static)) > 0.8
-    assert dynamic_mask.weights(np.array([[400.0, 10.0]])) > 0.8  # no corner was there
-
-
-def test_outliers_decay_after_the_car_has_left() -> None:
-    dynamic_mask, static = mask_with_car(8)
-    for _ in range(40):
-        pixels = np.concatenate([static, np.tile(PLACE, (3, 1))])
-        dynamic_mask = dynamic_mask.updated(pixels, np.ones(153, dtype=bool))
-    assert dynamic_mask.weights(PLACE[None]) > 0.8
-
-
-def test_corners_beyond_the_edge_belong_to_the_nearest_cell() -> None:
-    empty = DynamicMask.empty(416, 128)
-    dynamic_mask = empty.updated(np.array([[416.0, 128.0], [-0.4, -0.4]]), np.array([True, False]))
-    assert np.isfinite(dynamic_mask.weights(np.array([[416.0, 128.0], [-0.4, 0.0]]))).all()
-    assert (
-        dynamic_mask.corners[-1, -1]
-        == dynamic_mask.inliers[-1, -1]
-        == dynamic_mask.corners[0, 0]
-        == 1.0
-    )
-    assert dynamic_mask.inliers[0, 0] == 0.0

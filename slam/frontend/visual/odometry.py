@@ -5,15 +5,13 @@ from the ratio of learned to triangulated depth; perspective-n-point against lea
 does not.
 
 The error of learned depth and the motion prior are learned from the steps before: one wrong
-step teaches them to find the next one wrong too. So a step that loses a third of its inliers, or
-has a length that no car reaches, is estimated again from corners alone, and the road, the steps
-before and a car's acceleration vote between both.
+step teaches them to find the next one wrong too. So the road, the steps before and a car's
+acceleration vote on a step that loses a third of its inliers, or has a length that no car reaches.
 """
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,7 +53,6 @@ from slam.geometry.robust import MAD_TO_SIGMA, mad_sigma, median, weighted_media
 from slam.geometry.se3 import BoolArray, FloatArray, IntArray, apply, invert, length_of, make
 from slam.runtime.errors import Failed
 
-logger = logging.getLogger(__name__)
 MIN_INLIERS = 20  # of a measurement: each satisfies both constraints
 ESSENTIAL_SOURCE = "essential"
 PNP_SOURCE = "pnp"
@@ -162,7 +159,7 @@ class VisualOdometry:
             seconds = current.stamp - previous.stamp
             measured = (
                 self._still(ends, seconds, tracks, votes, depth)
-                or self._by_essential((previous, current), tracks, votes, learned, height_unscaled)
+                or self._by_essential(ends, seconds, tracks, votes, learned, height_unscaled)
                 or self._by_points(ends, tracks, votes, depth)
             )
         self._last = measured if isinstance(measured, Motion) else None
@@ -261,7 +258,8 @@ class VisualOdometry:
 
     def _by_essential(
         self,
-        frames: tuple[Frame, Frame],
+        ends: Ends,
+        seconds: float,
         tracks: Tracks,
         votes: BoolArray,
         learned: FloatArray,
@@ -270,43 +268,26 @@ class VisualOdometry:
         """Rotation and direction from the essential matrix, None where it is not well conditioned."""
         matches = self._matches(tracks, votes, learned, height, self.depth_error)
         rays_previous, rays_current = matches.rays_previous[votes], matches.rays_current[votes]
-        ends = frames[0].index, frames[1].index
         # the translation of an essential matrix is arbitrary under pure rotation: only used with
         # enough parallax
         R_current_previous = rotation_between(rays_previous, rays_current)
         unexplained = parallax_px(rays_previous, rays_current, R_current_previous, self._focal)
         if np.median(unexplained) < _LEAST_PARALLAX_PX[ends[1] > ends[0] + 1]:
             return None
-        history, seconds = self._history, frames[1].stamp - frames[0].stamp
-
-        def step(corners: Matches, before: MotionHistory) -> Step | None:
-            two_view = estimate(corners, before, self._seed)
-            if two_view is None or two_view.inliers.sum() < MIN_INLIERS:
-                return None
-            return self._triangulated(
-                ends, seconds, tracks, corners, trusted_depth(learned, height), two_view
-            )
-
-        usual = step(matches, history)
-        if usual is None:
+        two_view = estimate(matches, self._history, self._seed)
+        if two_view is None or two_view.inliers.sum() < MIN_INLIERS:
             return None
-        chosen = usual
-        is_possible = history.is_possible_speed(usual.speed(height, seconds), seconds)
-        if history.is_sudden_loss(usual.inlier_ratio) or is_possible is False:
-            # what depth and history say may be what is wrong
-            alone = step(matches.by_geometry_alone(), MotionHistory())
-            credible = most_credible([usual, alone], matches, height, seconds, history)
-            if credible is None:
-                return Failed("the step contradicts the road and the steps before")
-            chosen = credible
-            logger.info(
-                "geometry %d -> %d: %s",
-                *ends,
-                "as usual" if chosen is usual else "by corners alone",
-            )
+        depth = trusted_depth(learned, height)
+        step = self._triangulated(ends, seconds, tracks, matches, depth, two_view)
+        if step is None:
+            return None
+        is_possible = self._history.is_possible_speed(step.speed(height, seconds), seconds)
+        is_doubtful = self._history.is_sudden_loss(step.inlier_ratio) or is_possible is False
+        if is_doubtful and not is_credible(step, matches, height, seconds, self._history):
+            return Failed("the step contradicts the road and the steps before")
         self._height = height or self._height
-        self._learn(tracks, matches, learned, chosen, chosen.speed(self._height, seconds))
-        return chosen.motion
+        self._learn(tracks, matches, learned, step, step.speed(self._height, seconds))
+        return step.motion
 
     def _learn(
         self, tracks: Tracks, matches: Matches, learned: FloatArray, step: Step, speed: float
@@ -475,52 +456,44 @@ class Step:
         return self.motion.length_unscaled / height_unscaled / seconds
 
 
-def most_credible(
-    steps: Sequence[Step | None],
+def is_credible(
+    step: Step,
     matches: Matches,
     height_unscaled: float | None,
     seconds: float,
     history: MotionHistory,
-) -> Step | None:
-    """The step with most votes, the first of equal ones.
+) -> bool:
+    """Whether at least as many votes are for a step as against it.
 
     Args:
-        steps: estimates of one step; None for those that failed.
+        step: an estimate.
         matches: corners in both images.
         height_unscaled: of the camera above the road, in the unit of learned depth; None if
             unknown.
         seconds: between both frames.
         history: of the steps before.
-
-    Returns:
-        None where more votes are against each than for it.
     """
-    estimated = [step for step in steps if step is not None]
-    balance = []
-    for step in estimated:
-        speed = step.speed(height_unscaled, seconds)
-        is_possible = history.is_possible_speed(speed, seconds)
-        votes = [] if is_possible is None else [is_possible]
-        # points of this step and the one before have the ratio of lengths that learned depth has
-        if (
-            step.motion.length_ratio is not None
-            and history.speeds
-            and np.isfinite(speed / history.speeds[-1])
-        ):
-            ratio, _ = step.motion.length_ratio
-            votes.append(bool(abs(np.log(speed / history.speeds[-1]) - ratio) < _AGREEMENT))
-        # the corners on the road are triangulated at the camera's height below it
-        road = matches.on_road & step.two_view.inliers
-        if height_unscaled is not None and road.sum() >= _LEAST_ROAD_CORNERS:
-            rays = matches.rays_previous[road]
-            depth = triangulated_depth(rays, matches.rays_current[road], step.two_view.unit_pose)
-            height = median(depth * rays[:, 1]) * step.motion.length_unscaled
-            votes.append(bool(abs(np.log(max(height, 1e-9) / height_unscaled)) < _AGREEMENT))
-        # the direction is about the median of the last hundred steps, which a few wrong ones do not
-        # change
-        prior = history.prior()
-        if np.isfinite(prior.axis_sigma):
-            votes.append(prior.deviation(step.two_view.unit_pose.direction) < 3.0)
-        balance.append(sum(1 if vote else -1 for vote in votes))
-    best = int(np.argmax(balance))
-    return estimated[best] if balance[best] >= 0 else None
+    speed = step.speed(height_unscaled, seconds)
+    is_possible = history.is_possible_speed(speed, seconds)
+    votes = [] if is_possible is None else [is_possible]
+    # points of this step and the one before have the ratio of lengths that learned depth has
+    if (
+        step.motion.length_ratio is not None
+        and history.speeds
+        and np.isfinite(speed / history.speeds[-1])
+    ):
+        ratio, _ = step.motion.length_ratio
+        votes.append(bool(abs(np.log(speed / history.speeds[-1]) - ratio) < _AGREEMENT))
+    # the corners on the road are triangulated at the camera's height below it
+    road = matches.on_road & step.two_view.inliers
+    if height_unscaled is not None and road.sum() >= _LEAST_ROAD_CORNERS:
+        rays = matches.rays_previous[road]
+        depth = triangulated_depth(rays, matches.rays_current[road], step.two_view.unit_pose)
+        height = median(depth * rays[:, 1]) * step.motion.length_unscaled
+        votes.append(bool(abs(np.log(max(height, 1e-9) / height_unscaled)) < _AGREEMENT))
+    # the direction is about the median of the last hundred steps, which a few wrong ones do not
+    # change
+    prior = history.prior()
+    if np.isfinite(prior.axis_sigma):
+        votes.append(prior.deviation(step.two_view.unit_pose.direction) < 3.0)
+    return 2 * sum(votes) >= len(votes)

@@ -85,11 +85,6 @@ class Matches:
     votes: BoolArray
     focal_px: float
 
-    def by_geometry_alone(self) -> Matches:
-        """The same corners without what learned depth and the steps before say of them."""
-        everyone = np.ones(len(self.votes), np.bool_)
-        return replace(self, depth_previous=np.full(len(everyone), np.nan), votes=everyone)
-
     @cached_property
     def residuals(self) -> Residuals:
         """Those of the corners under any motion."""

@@ -342,7 +342,7 @@ def _solved(graph: Any, values: Any, tolerance: float, failure: str) -> Any:
         reason = str(error).strip().partition("\n")[0]
         raise SlamError(f"{failure}: {reason}") from error
     logger.info(
-        "graph: %d factors, error %.4g to %.4g in %d iterations",
+        "pose graph: %d factors, error %.4g to %.4g in %d iterations",
         graph.size(),
         graph.error(values),
         optimiser.error(),

@@ -351,7 +351,7 @@ def simulate(
     ] = False,
     motion: Annotated[
         str | None,
-        typer.Option(help="how the camera goes through rooms: walk, look, phone, drone or robot"),
+        typer.Option(help="of the camera in rooms: walk, look, phone, drone, robot or turn"),
     ] = None,
     rate: Annotated[float, typer.Option(help="frames a second, of rooms 5 to 60")] = 10.0,
     device: UnusedDevice = "auto",

@@ -7,6 +7,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
+import numpy as np
+
 from slam.frames import Ends, RelativePose, SnippetPoses, TrackingEvent, View, runs
 from slam.frontend.gaps import interpolate_gaps
 from slam.frontend.keyframes.relative_poses import NO_MAPS, KeyframePoses
@@ -14,7 +16,7 @@ from slam.frontend.measured import FrontEnd, Keyframe, Measured, frame_support, 
 from slam.frontend.road import RoadStep, with_slope
 from slam.frontend.rotations import smooth_rotations
 from slam.frontend.visual.motion import Motion, Steps, triangulated
-from slam.geometry.se3 import FloatArray
+from slam.geometry.se3 import FloatArray, path_distance
 from slam.runtime.errors import Failed
 
 logger = logging.getLogger(__name__)
@@ -23,6 +25,8 @@ DOUBLED = "the image repeats the one before while the camera moves"
 # of the corners: across a cut few are found again, by chance, before a lorry half of them
 _LEAST_FOUND = 0.2
 _LONGEST_GAP = 30  # interpolated frames, after which the place is only guessed
+# a step so many times as long as nine of ten is none of a camera: about 100 medians
+_LEAP, _USUAL = 50.0, 0.9
 
 
 @dataclass(frozen=True)
@@ -104,6 +108,19 @@ class Drive:
         """`frame_support` of all frames ``(N,)``; None where maps of keyframes give the poses."""
         return None if self.by_keyframes else frame_support(range(len(self)), self.steps.values())
 
+    def parted(self, T_world_camera: FloatArray) -> Drive:
+        """The drive with a new segment after each step of a trajectory ``(N, 4, 4)`` that no camera makes.
+
+        Measurements that contradict each other leave such steps.
+        """
+        lengths = np.diff(path_distance(T_world_camera))
+        leaps = np.flatnonzero(lengths > _LEAP * np.quantile(lengths, _USUAL))
+        lasts = [k for k in leaps.tolist() if {k, k + 1}.isdisjoint(self.interpolated)]
+        begins = dict.fromkeys([k + 1 for k in lasts], "no camera makes the step to it")
+        begins |= {part.first: part.reason for part in self.segments}
+        ends = {part.last for part in self.segments}.union(lasts)
+        return replace(self, segments=_segments(begins, ends))
+
 
 def find_cuts(
     failures: Mapping[Ends, float], measured: Collection[Ends], doubtful: Collection[int]
@@ -155,6 +172,11 @@ def find_segments(
             begins[last + 1] = (
                 f"{last - first + 1} frames before it are interpolated: {interpolated[first]}"
             )
+    return _segments(begins, ends)
+
+
+def _segments(begins: Mapping[int, str], ends: Collection[int]) -> list[Segment]:
+    """By their first frames with the reasons, and by their last frames."""
     return [
         Segment(first, last, begins[first])
         for first, last in zip(sorted(begins), sorted(ends), strict=True)

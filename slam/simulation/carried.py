@@ -6,7 +6,6 @@ places, turns, sweeps and rests; the unrest of its carrier is on top of all of t
 
 import functools
 from dataclasses import dataclass
-from typing import get_args
 
 import cv2
 import numpy as np
@@ -17,7 +16,6 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from slam.geometry import se3
 from slam.simulation.geometry import FloatArray, IntArray
 from slam.simulation.interior import Interior
-from slam.simulation.options import Motion
 
 CELL = 0.08  # of the floor, metres
 _CLEAR_M = 0.44  # of a path's cells from walls and furniture, which begin up to a cell nearer
@@ -141,17 +139,21 @@ class Gait:
     sway_m: float  # to the sides with every second step, and by unrest
     wander_deg: float  # how far it looks to the sides, and by a third of it up and down, on its way
     tremor_deg: float  # of the hand or the motors
+    roll_deg: float  # how far it tilts to the sides
     pitch_deg: float  # of the camera, upwards
 
 
+# of each `slam.simulation.options.Motion`
 GAITS: dict[str, Gait] = {
-    "walk": Gait((1.45, 1.7), 0.02, 1.1, 80.0, (0.5, 0.2, 0.3), 0.025, 0.03, 10.0, 0.25, -3.0),
-    "look": Gait((1.45, 1.7), 0.05, 0.8, 70.0, (1.6, 1.0, 0.4), 0.02, 0.03, 14.0, 0.3, -2.0),
-    "phone": Gait((1.2, 1.5), 0.08, 0.8, 110.0, (0.8, 0.8, 0.4), 0.015, 0.04, 22.0, 0.5, -10.0),
-    "drone": Gait((1.0, 1.25), 0.2, 0.9, 70.0, (0.6, 0.5, 0.3), 0.0, 0.05, 30.0, 0.15, -5.0),
-    "robot": Gait((0.32, 0.45), 0.0, 0.5, 60.0, (0.8, 0.0, 0.3), 0.0, 0.0, 0.0, 0.04, 4.0),
+    "walk": Gait((1.45, 1.7), 0.02, 1.1, 80.0, (0.5, 0.2, 0.3), 0.025, 0.03, 10.0, 0.25, 1.0, -3.0),
+    "look": Gait((1.45, 1.7), 0.05, 0.8, 70.0, (1.6, 1.0, 0.4), 0.02, 0.03, 14.0, 0.3, 1.2, -2.0),
+    "phone": Gait(
+        (1.2, 1.5), 0.08, 0.8, 110.0, (0.8, 0.8, 0.4), 0.015, 0.04, 22.0, 0.5, 2.0, -10.0
+    ),
+    "drone": Gait((1.0, 1.25), 0.2, 0.9, 70.0, (0.6, 0.5, 0.3), 0.0, 0.05, 30.0, 0.15, 0.6, -5.0),
+    "robot": Gait((0.32, 0.45), 0.0, 0.5, 60.0, (0.8, 0.0, 0.3), 0.0, 0.0, 0.0, 0.04, 0.16, 4.0),
+    "turn": Gait((1.2, 1.5), 0.03, 0.0, 90.0, (0.7, 3.0, 0.0), 0.0, 0.03, 30.0, 0.3, 15.0, -5.0),
 }
-assert tuple(GAITS) == get_args(Motion)
 
 
 class Carried:
@@ -173,11 +175,10 @@ class Carried:
         """
         rng, gait = np.random.default_rng([seed, 53, *motion.encode()]), GAITS[motion]
         turn = np.deg2rad(min(gait.turn_deg, 0.9 * FASTEST_TURN_DEG * rate))
-        base, moved = _Walk(floor, gait, turn, rng).over(int(np.ceil(seconds * CLOCK)) + 2)
+        base = _Walk(floor, gait, turn, rng).over(int(np.ceil(seconds * CLOCK)) + 2)
         base = gaussian_filter1d(base, _SETTLED_S * CLOCK, axis=0, mode="nearest")
-        moved = gaussian_filter1d(moved, _SETTLED_S * CLOCK, mode="nearest")
         count = len(base)
-        x, y, yaw, pitch = base.T
+        x, y, yaw, pitch, moved = base.T
         step = np.cumsum(moved * gait.speed / CLOCK) / _STRIDE_M * 2.0 * np.pi
         free = np.clip(floor.clearance(base[:, :2]) - _CARRIER_CLEAR_M, 0.0, 1.0)
         side = moved * gait.sway_m * np.sin(0.5 * step) + gait.sway_m * _unrest(rng, count, 0.6)
@@ -198,7 +199,7 @@ class Carried:
             + tremors[1]
         )
         roll = (
-            4.0 * unsteady * _unrest(rng, count, 0.8)
+            np.deg2rad(gait.roll_deg) * _unrest(rng, count, 0.8)
             + 0.3 * moved * gait.sway_m * np.cos(0.5 * step)
             + tremors[2]
         )
@@ -248,16 +249,16 @@ class _Walk:
         self._place = int(rng.integers(len(floor.places)))
         self._yaw = float(rng.uniform(-np.pi, np.pi))
         self._parts: list[FloatArray] = []
-        self._moved: list[FloatArray] = []
 
-    def over(self, ticks: int) -> tuple[FloatArray, FloatArray]:
-        """So many ticks: ``(ticks, 4)`` and ``(ticks,)``."""
-        while sum(map(len, self._moved)) < ticks:
-            self._leg()
+    def over(self, ticks: int) -> FloatArray:
+        """So many ticks, ``(ticks, 5)``."""
+        while sum(map(len, self._parts)) < ticks:
+            if self._gait.speed:
+                self._leg()
             for act, share in zip((self._look_round, self._sweep, self._stand), self._gait.rests):
                 for _ in range(int(share + self._rng.random())):
                     act()
-        return np.concatenate(self._parts)[:ticks], np.concatenate(self._moved)[:ticks]
+        return np.concatenate(self._parts)[:ticks]
 
     def _leg(self) -> None:
         """Walk to another place, rather a near one in a room that was seldom visited."""
@@ -274,13 +275,9 @@ class _Walk:
         length = se3.distance_along(path)
         along = np.linspace(0.0, length[-1], max(int(length[-1] / 0.02), 8))
         path = np.stack([np.interp(along, length, axis) for axis in path.T], axis=1)
-        ahead = np.minimum(np.arange(len(path)) + 25, len(path) - 1)
-        ahead[-25:] = len(path) - 1
-        behind = (
-            np.minimum(np.arange(len(path)), len(path) - 26)
-            if len(path) > 26
-            else np.zeros(len(path), dtype=int)
-        )
+        rows = np.arange(len(path))
+        ahead = np.minimum(rows + 25, rows[-1])
+        behind = np.minimum(rows, max(len(path) - 26, 0))
         towards = path[ahead] - path[behind]
         heading = np.unwrap(np.arctan2(towards[:, 1], towards[:, 0]))
         self._turn_by(float((heading[0] - self._yaw + np.pi) % (2.0 * np.pi) - np.pi))
@@ -289,13 +286,11 @@ class _Walk:
         walking, turning = np.diff(along) / pace[1:], np.abs(np.diff(heading)) / (0.8 * self._turn)
         arrival = np.concatenate([[0.0], np.cumsum(np.maximum(walking, turning))])
         ticks = np.arange(1, int(arrival[-1] * CLOCK) + 1) / CLOCK
-        at = np.interp(ticks, arrival, np.arange(len(path)))
-        rows = np.arange(len(path))
-        track = [np.interp(at, rows, channel) for channel in (path[:, 0], path[:, 1], heading)]
-        self._add(
-            np.stack([*track, np.zeros_like(at)], axis=1),
-            np.interp(at, rows, pace) / self._gait.speed,
-        )
+        at = np.interp(ticks, arrival, rows)
+        channels = *path.T, heading, pace
+        x, y, yaw, walked = (np.interp(at, rows, channel) for channel in channels)
+        level = np.zeros_like(at)
+        self._parts.append(np.stack([x, y, yaw, level, walked / self._gait.speed], axis=1))
         self._yaw, self._place = float(heading[-1]), goal
 
     def _look_round(self) -> None:
@@ -322,11 +317,5 @@ class _Walk:
 
     def _stay(self, yaw: FloatArray, pitch: FloatArray) -> None:
         x, y = self._parts[-1][-1, :2] if self._parts else self._floor.places[self._place]
-        self._add(
-            np.stack([np.full_like(yaw, x), np.full_like(yaw, y), yaw, pitch], axis=1),
-            np.zeros_like(yaw),
-        )
-
-    def _add(self, part: FloatArray, moved: FloatArray) -> None:
-        self._parts.append(part)
-        self._moved.append(moved)
+        x, y, still = (np.full_like(yaw, value) for value in (x, y, 0.0))
+        self._parts.append(np.stack([x, y, yaw, pitch, still], axis=1))

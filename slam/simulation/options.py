@@ -16,7 +16,7 @@ _READOUT_S = 0.025  # of a rolling shutter, where frames are far enough apart
 _RATES = (5.0, 60.0)
 
 RouteKind = Literal["loop", "grid", "straight"]
-Motion = Literal["walk", "look", "phone", "drone", "robot"]
+Motion = Literal["walk", "look", "phone", "drone", "robot", "turn"]
 Hazard = Literal["moving-cars", "exposure", "blur", "stop", "rain"]
 RoomHazard = Literal["people", "exposure", "blur", "rolling-shutter", "stop"]
 StreetKind = Literal["town", "avenue", "country", "motorway"]

@@ -27,6 +27,7 @@ from slam.frontend.gps import LocalFrame, Location
 from slam.frontend.visual.odometry import STILL_SOURCE
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
+from slam.graph.pose_graph import PoseGraph
 from slam.loops.features import FeatureExtractor
 from slam.mapping.depth import DepthRefiner
 from slam.mapping.submap import Fusion
@@ -154,6 +155,24 @@ def test_a_pose_that_is_no_number_costs_a_gap() -> None:
     result = SlamPipeline(drive, oracle, load_config(None, NO_IMAGES)).run()
     assert [snippet.target for snippet in result.drive.trusted] == [*range(2, 20), *range(21, 58)]
     assert ate(result.optimised, result.reference) < 0.1
+
+
+def test_a_step_that_no_camera_makes_begins_a_segment(monkeypatch: pytest.MonkeyPatch) -> None:
+    truth, solve = room.walk(30), PoseGraph.optimise
+    drive = LevelRoad(truth)
+    drive.intrinsics, drive.camera_height_m = room.INTRINSICS, None
+    monkeypatch.setattr(drive, "frame", lambda index: room.frame(index, truth[index]))
+
+    def torn(graph: PoseGraph, T_world_camera: FloatArray) -> FloatArray:
+        solved = solve(graph, T_world_camera)
+        solved[20:, :3, 3] += 50.0
+        return solved
+
+    monkeypatch.setattr(PoseGraph, "optimise", torn)
+    oracle = OraclePredictor(truth, lambda index: room.depth_map(truth[index]))
+    settings = load_config(None, ["mapping.enabled=false", "keyframes.use=always"])
+    result = SlamPipeline(drive, oracle, settings).run()
+    assert [(part.first, part.last) for part in result.drive.segments] == [(0, 19), (20, 29)]
 
 
 @pytest.mark.parametrize("stage", ["close_loops", "PoseGraph"])

@@ -130,7 +130,7 @@ def check_camera(seen: FollowedCorners, stated: Intrinsics) -> FoundCamera:
     pairs = seen.keyframe.max(initial=0) // _KEYFRAMES_CHECKED
     for window in windows_that_turn(seen)[: 2 * pairs]:
         longest = np.argsort(-np.bincount(window.point), kind="stable")[:_CHECKED]
-        told.append(calibrated(window.chosen(np.isin(window.point, longest), least=2)[0]))
+        told.append(calibrated(window.chosen(np.isin(window.point, longest), least=2)[0], _FEW))
         if joined(told).sigmas_from(stated) < _DOUBTFUL:
             break
     return joined(told)
@@ -193,8 +193,8 @@ def windows_that_turn(seen: FollowedCorners) -> list[FollowedCorners]:
     return windows
 
 
-def calibrated(seen: FollowedCorners) -> Window | None:
-    """What a window says of its camera; None where it tells nothing."""
+def calibrated(seen: FollowedCorners, iterations: int = _MANY) -> Window | None:
+    """What a window says of its camera, so many ``iterations`` between outliers; None where it tells nothing."""
     if (started := _turning(seen)) is None:
         return None
     problem, start = started
@@ -207,7 +207,7 @@ def calibrated(seen: FollowedCorners) -> Window | None:
     free = _BUT_FOCAL if lowest is None else _ALL
     start = lowest or start
     for _ in range(3):
-        start = problem.solved(start, free, sigma, _FEW)
+        start = problem.solved(start, free, sigma, iterations)
         problem, start = problem.without_outliers(start, 5.0)
         sigma = problem.spread(start)
     start = problem.solved(start, free, sigma, _MANY)
@@ -238,8 +238,8 @@ def joined(windows: Iterable[Window | None]) -> FoundCamera:
     lens = weights @ lenses / weights.sum()
     if sigma > ROUGH:
         lens = _PRIOR + [0, 1, 1, 0, 0] * lens
-    _, first, second, x, y = lens.tolist()
-    focal = math.exp(lens[0])
+    log_focal, first, second, x, y = lens.tolist()
+    focal = math.exp(log_focal)
     seen = [window.turn_deg for window in telling if np.isfinite(window.sigmas[0])]
     radial = first * focal**2, second * focal**4
     return FoundCamera(focal, radial, (x, y), sigma, len(seen), max(seen, default=0.0))
@@ -283,7 +283,7 @@ class Problem:
                 profile.append((cost, each))
                 if cost > min(other for other, _ in profile) + _MOST_RISE:
                     break
-        profile.sort(key=lambda step: float(step[1].lens[0]))
+        profile.sort(key=lambda step: step[1].lens[0])
         least = int(np.argmin([cost for cost, _ in profile]))
         return profile[least][1] if 0 < least < len(profile) - 1 else None
 

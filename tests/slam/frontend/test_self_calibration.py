@@ -11,7 +11,7 @@ import pytest
 
 from erfsfm.common.readers.camera_file import UNKNOWN_FX_SIGMA
 from slam.frames import Frame, Intrinsics
-from slam.frontend.followed_corners import follow
+from slam.frontend.followed_corners import FollowedCorners, follow
 from slam.frontend.self_calibration import (
     calibrated,
     check_camera,
@@ -37,9 +37,8 @@ def test_a_street_that_turns_shows_its_focal_length() -> None:
     wrong, seen = replace(camera, fx=1.25 * camera.fx), follow(images(STREET, 40, 74))
     rounds = np.arange(3)[:, None]
     keyframe, point = seen.keyframe + 30 * rounds, seen.point + len(seen) * rounds
-    longer = replace(
-        seen, keyframe=keyframe.ravel(), point=point.ravel(), image=np.tile(seen.image, (3, 1))
-    )
+    image = np.tile(seen.image, (3, 1))
+    longer = FollowedCorners(keyframe.ravel(), point.ravel(), image, seen.pixel)
     assert check_camera(longer, wrong).sigmas_from(wrong) > 3.0
     assert check_camera(longer, camera).sigmas_from(camera) < 3.0
     assert check_camera(seen, wrong).sigma == UNKNOWN_FX_SIGMA  # it is too short

@@ -72,7 +72,7 @@ _LOOKED_BACK = 4  # keyframes between which points have parallax before a first 
 # from which on a first motion is doubted: a reversed one takes most of the flow for a turn
 _DOUBTFUL_PARALLAX_RATIO = 0.005
 _MAX_CORNERS = 500  # of a keyframe
-# median residual where few points have parallax, above which corners are sought by dense flow
+# residual of half of the points where few have parallax, above which corners are sought by dense flow
 _DOUBTFUL_PX = 0.5 * INLIER_PX
 # of the median residual of corners without translation over that with it: blur and corners on edges
 # always agree on some translation (on the spot mostly 0.4 to 1.3, of a walk 1.5 and more)
@@ -263,7 +263,8 @@ class KeyframeOdometry:
             return False
         is_settled = self._parallax.settled[track_ids].sum() >= MIN_POINTS
         residual_px = float(np.median(pose.residual_px))
-        if not is_doubtful and residual_px > (INLIER_PX if is_settled else _DOUBTFUL_PX):
+        fits = pose.residual_px < (INLIER_PX if is_settled else _DOUBTFUL_PX)
+        if not is_doubtful and fits.mean() < 0.5:
             return False
         self._lost, T_before = 0, self._T_camera_world
         last, intrinsics = segment.keyframes[-1], self._intrinsics

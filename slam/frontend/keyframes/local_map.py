@@ -26,7 +26,7 @@ from slam.geometry.se3 import FloatArray, apply, invert
 TrackIds = NDArray[np.int64]
 
 _IMAGES_KEPT = 20
-_LOOKED_BACK = 20  # keyframes between which points of the newest one have parallax
+LOOKED_BACK = 20  # keyframes between which points of the newest one have parallax
 _MATCHED = KEYFRAME_SEARCH._replace(levels=1)  # guesses are near
 _BORDER_PX = 8
 _LEAST_MATCHED = 8
@@ -107,7 +107,8 @@ class TrackedKeyframe:
 
     ``places`` ``(M, 2)`` are where its image has them: with a rolling shutter, pixels are as of the
     middle row. ``learned_depth`` ``(M,)`` is positive, NaN where unknown, ``descriptors`` are
-    ``(M, 32)``; ``grey`` is None once the image is not kept any more.
+    ``(M, 32)``; ``grey`` is None once the image is not kept any more. After a turn on the spot
+    (``is_turn``) corners say nothing of where the camera is.
     """
 
     index: int
@@ -118,6 +119,7 @@ class TrackedKeyframe:
     learned_depth: FloatArray
     descriptors: Descriptors
     grey: Grey | None
+    is_turn: bool = False
 
     def with_depth(self, depth: DepthMap) -> TrackedKeyframe:
         """The same with learned depth ``(H, W)`` at its corners."""
@@ -212,7 +214,7 @@ class LocalMap:
         tracks, learned = newest.track_ids, newest.learned_depth
         ratios = self.ratios(newest)
         both, new = ratios > 0.0, ~self.known(tracks) & (learned > 0.0)
-        parallax = self.parallax(self.keyframes[-_LOOKED_BACK:])
+        parallax = self.parallax(self.keyframes[-LOOKED_BACK:])
         by_rays = parallax.by_rays(PIXEL_SIGMA / intrinsics.fx)[tracks[both]]
         weights = 1.0 / (DEPTH_SIGMA**2 + by_rays**2)
         unit = weighted_median(ratios[both], weights) if both.sum() >= _LEAST_RATIOS else 1.0
@@ -220,12 +222,6 @@ class LocalMap:
         self.points[tracks[new]] = apply(invert(newest.T_camera_world), rays)
         parallax.see(newest.T_camera_world, tracks[new])
         return parallax
-
-    def spread(self, intrinsics: Intrinsics, parallax: Parallax | None = None) -> FloatArray:
-        """One sigma of the newest keyframe's points ``(M, 3)``, along the ray on which each was seen first."""
-        parallax = parallax or self.parallax(self.keyframes[-_LOOKED_BACK:])
-        spread = parallax.spread(PIXEL_SIGMA / intrinsics.fx)
-        return np.nan_to_num(spread[self.keyframes[-1].track_ids])
 
     def adjust(self, intrinsics: Intrinsics) -> TrackIds:
         """Adjust the last keyframes and their points; older ones that see many of these points stay fixed.
@@ -238,12 +234,9 @@ class LocalMap:
         seen[np.concatenate([keyframe.track_ids for keyframe in self.keyframes[first:]])] = True
         seen &= np.isfinite(self.points[:, 0])
         # older keyframes that share most of these points
-        shared = []
-        for k, keyframe in enumerate(self.keyframes[:first]):
-            points = int(seen[keyframe.track_ids].sum())
-            if points >= _SHARED:
-                shared.append((points, k))
-        fixed = sorted(k for _, k in sorted(shared, reverse=True)[:_ADJUSTED])
+        shared = np.array([seen[keyframe.track_ids].sum() for keyframe in self.keyframes[:first]])
+        most = np.argsort(shared, kind="stable")[::-1][:_ADJUSTED]
+        fixed = np.sort(most[shared[most] >= _SHARED]).tolist()
         chosen = [*fixed, *range(first, len(self.keyframes))]
         limits = _YOUNG_LIMITS if len(self.keyframes) <= _YOUNG else _LIMITS
         gone, dead = self.solve(chosen, max(len(fixed), 1 + (first > 0)), seen, intrinsics, limits)
@@ -262,7 +255,7 @@ class LocalMap:
 
         Args:
             chosen: rows of the keyframes.
-            fixed: how many of them stay, the first ones.
+            fixed: how many of them stay, the first ones; turns on the spot stay, too.
             seen: the points that take part ``(N,)``, where two of these keyframes see them.
             intrinsics: of all images.
             limits: iterations, and the relative fall of the cost at which it ends.
@@ -273,7 +266,8 @@ class LocalMap:
             thereby lost their point.
         """
         sightings, track_ids = self.sightings(chosen, seen, intrinsics)
-        free = np.arange(len(chosen)) >= fixed
+        free = np.array([not self.keyframes[k].is_turn for k in chosen])
+        free[:fixed], free[-1] = False, True
         poses = np.array([self.keyframes[k].T_camera_world for k in chosen])
         problem = BundleAdjustment(sightings, intrinsics, free)
         solved = problem.solve(poses, self.points[track_ids], *limits)

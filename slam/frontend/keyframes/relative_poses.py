@@ -50,8 +50,8 @@ class KeyframePoses:
 
     def is_inside(self, pose: RelativePose) -> bool:
         """Whether both frames of a measurement lie in one connected component of maps."""
-        first, last = (self.component.get(frame) for frame in pose.ends)
-        return first is not None and first == last
+        first, last = pose.ends
+        return self.component.get(first, -1) == self.component.get(last, -2)
 
     @property
     def steps(self) -> set[Ends]:
@@ -64,18 +64,13 @@ class KeyframePoses:
 
     def relates(self, first: int) -> bool:
         """Whether the frames before ``first`` and the frames from it on have poses in one map."""
-        before = max((frame for frame in self.segments if frame < first), default=None)
-        after = min((frame for frame in self.segments if frame >= first), default=None)
-        return (
-            before is not None
-            and after is not None
-            and self.segments[before] == self.segments[after]
-        )
+        before = max((frame for frame in self.segments if frame < first), default=-1)
+        after = min((frame for frame in self.segments if frame >= first), default=-1)
+        return self.segments.get(before, -1) == self.segments.get(after, -2)
 
     def length(self, first: int, last: int) -> float | None:
         """The distance of two frames; None where no map has both."""
-        number = self.segments.get(first)
-        if number is None or number != self.segments.get(last):
+        if self.segments.get(first, -1) != self.segments.get(last, -2):
             return None
         apart = self.T_map_camera[last][:3, 3] - self.T_map_camera[first][:3, 3]
         return float(np.linalg.norm(apart))
@@ -135,7 +130,7 @@ def _connect(segments: dict[int, int], turns: Sequence[RelativePose]) -> None:
 
 def _segment_poses(segment: LocalMap, intrinsics: Intrinsics, seed: int) -> list[RelativePose]:
     keyframes = segment.keyframes
-    place = {keyframe.index: k for k, keyframe in enumerate(keyframes)}
+    T_of = {keyframe.index: keyframe.T_camera_world for keyframe in keyframes}
     poses: list[RelativePose] = []
     for before, after in pairwise(keyframes):
         seen = _seen_from(
@@ -145,15 +140,15 @@ def _segment_poses(segment: LocalMap, intrinsics: Intrinsics, seed: int) -> list
         poses.append(_relative(before, after.index, after.T_camera_world, sigmas))
     T_guess = keyframes[0].T_camera_world
     for frame in segment.frames:
-        if frame.index in place:
-            T_guess = keyframes[place[frame.index]].T_camera_world
+        if frame.index in T_of:
+            T_guess = T_of[frame.index]
             continue
         pixels = frame.pixels.astype(np.float64)
         guess = T_guess if frame.T_camera_world is None else frame.T_camera_world
         located = _seen_from(segment, frame.track_ids, pixels, guess, intrinsics, seed)
         if located is not None:
             T_guess, sigmas = located
-            nearest = max((k for k in keyframes if k.index < frame.index), key=lambda k: k.index)
+            nearest = [keyframe for keyframe in keyframes if keyframe.index < frame.index][-1]
             poses.append(_relative(nearest, frame.index, T_guess, sigmas))
     return poses
 

@@ -147,13 +147,10 @@ def _part_before(part_of: NDArray[np.intp]) -> NDArray[np.intp]:
 
 def _pace(keyframes: Sequence[TrackedKeyframe], tied: NDArray[np.bool_]) -> float:
     """The median way of the camera a frame between keyframes that points tie; 0 without any."""
-    paces = []
-    for (earlier, later), is_tied in zip(pairwise(keyframes), tied, strict=True):
-        if is_tied:
-            T_earlier_later = earlier.T_camera_world @ invert(later.T_camera_world)
-            frames = later.index - earlier.index
-            paces.append(np.linalg.norm(T_earlier_later[:3, 3]) / frames)
-    return float(np.median(paces)) if paces else 0.0
+    centres = invert(np.array([keyframe.T_camera_world for keyframe in keyframes]))[:, :3, 3]
+    frames = np.diff([keyframe.index for keyframe in keyframes])
+    paces = np.linalg.norm(np.diff(centres, axis=0), axis=1)[tied] / frames[tied]
+    return float(np.median(paces)) if len(paces) else 0.0
 
 
 def _held(segment: LocalMap, carried: FloatArray) -> LocalMap:

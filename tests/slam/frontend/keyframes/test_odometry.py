@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import room
 
-from slam.frames import KEYFRAME_SOURCE
+from slam.frames import KEYFRAME_SOURCE, Frame
 from slam.frontend.keyframes.odometry import KeyframeOdometry
 from slam.frontend.keyframes.relative_poses import KeyframePoses, chained, keyframe_poses
 from slam.geometry.se3 import from_rotation_vector, invert, rotation_angle, umeyama
@@ -51,17 +51,19 @@ def test_a_map_begins_on_a_plane(seed: int) -> None:
     assert np.rad2deg(turned).max() < 1.5
 
 
-@pytest.mark.parametrize("motion", ["standing", "turning"])
-def test_without_parallax_the_camera_has_its_turn_and_stays(motion: str) -> None:
-    truth = room.walk(25, step_m=0.0, turn=0.004)
-    if motion == "standing":
-        truth[:] = np.eye(4)
-    T = chained(poses(room.tracked(truth)).poses)
-    assert sorted(T) == list(range(25))
-    estimate = np.stack([T[k] for k in range(25)])
-    turned = rotation_angle(np.swapaxes(estimate[:, :3, :3], 1, 2) @ truth[:, :3, :3])
-    assert np.rad2deg(turned).max() < 0.3
-    assert np.linalg.norm(estimate[:, :3, 3], axis=1).max() < 0.01 * 2.0 * room.FAR
+def test_blur_of_a_turn_on_the_spot_is_no_motion() -> None:
+    """Corners of blurred images agree on a translation: without the turn, rotations were 0.6 degrees off."""
+    moments = room.walk(152, step_m=0.0, turn=0.005)
+    odometry = KeyframeOdometry(room.INTRINSICS)
+    for k in range(38):
+        exposed = [room.image(T) for T in moments[4 * k : 4 * k + 3]]
+        view = Frame(k, k / 30.0, np.mean(exposed, axis=0).astype(np.uint8))
+        odometry.follow(view)
+        odometry.learn(view, room.depth_map(np.eye(4)))
+    T = odometry.segments[0].T_world_camera
+    true = moments[[4 * keyframe.index + 1 for keyframe in odometry.segments[0].keyframes]]
+    turned = rotation_angle(np.swapaxes(T[:, :3, :3], 1, 2) @ (invert(true[0]) @ true)[:, :3, :3])
+    assert np.rad2deg(turned).max() < 0.35
 
 
 def test_standing_after_a_walk_adds_no_keyframe_and_does_not_drift() -> None:

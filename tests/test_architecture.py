@@ -79,7 +79,7 @@ def parameters(function: Function) -> int:
     return len([each for each in every if each is not None and each.arg not in ("self", "cls")])
 
 
-def test_every_module_and_public_name_says_what_it_is() -> None:
+def test_every_module_and_public_name_says_what_it_is():
     silent = [name for name in SOURCES if not ast.get_docstring(tree_of(name))]
     silent += [
         f"{name}:{node.name}"
@@ -90,7 +90,7 @@ def test_every_module_and_public_name_says_what_it_is() -> None:
     assert not silent
 
 
-def test_functions_are_short_and_take_few_parameters() -> None:
+def test_functions_are_short_and_take_few_parameters():
     over = set()
     for name in SOURCES:
         for node in nodes(name):
@@ -102,7 +102,7 @@ def test_functions_are_short_and_take_few_parameters() -> None:
     assert not over
 
 
-def test_only_command_lines_and_tools_print() -> None:
+def test_only_command_lines_and_tools_print():
     calls = {
         name
         for name in MODULES
@@ -114,7 +114,7 @@ def test_only_command_lines_and_tools_print() -> None:
     assert calls <= {"erfsfm/cli.py", "slam/commands/cli.py"}
 
 
-def test_each_heavy_library_has_one_home() -> None:
+def test_each_heavy_library_has_one_home():
     assert uses("gtsam") == {"slam/graph/pose_graph.py"}
     assert uses("evo") == {"slam/evaluation/trajectory.py"}
     assert uses("open3d") == set()  # through the door of slam/runtime/imports.py
@@ -122,7 +122,7 @@ def test_each_heavy_library_has_one_home() -> None:
     assert not [name for name in uses("torch") if name.startswith("slam/")]
 
 
-def test_no_module_is_named_like_one_of_python_and_every_folder_is_a_package() -> None:
+def test_no_module_is_named_like_one_of_python_and_every_folder_is_a_package():
     """Run as a file, a package's folder comes first on the path; contracts of imports do not see other folders."""
     names = {Path(name).stem for name in SOURCES} - {"__init__", "__main__"}
     assert not names & set(sys.stdlib_module_names)
@@ -130,7 +130,7 @@ def test_no_module_is_named_like_one_of_python_and_every_folder_is_a_package() -
     assert not list((ROOT / "tests").rglob("__init__.py"))
 
 
-def test_each_file_of_tests_mirrors_a_module() -> None:
+def test_each_file_of_tests_mirrors_a_module():
     tests = ROOT / "tests"
     without_module = []
     for part in (*PACKAGES, "tools"):
@@ -141,7 +141,7 @@ def test_each_file_of_tests_mirrors_a_module() -> None:
     assert not without_module, "\n".join(without_module)
 
 
-def test_the_package_shows_its_doors_alone() -> None:
+def test_the_package_shows_its_doors_alone():
     assert {name for name in dir(slam) if not name.startswith("__")} == {
         "RunFolder",
         "Slam",
@@ -150,14 +150,14 @@ def test_the_package_shows_its_doors_alone() -> None:
     }
 
 
-def test_both_packages_are_of_one_distribution_and_one_place() -> None:
+def test_both_packages_are_of_one_distribution_and_one_place():
     """Other distributions ship a package ``slam`` too; pip would merge them without a word."""
     assert erfsfm.DISTRIBUTION == slam.DISTRIBUTION == "erfsfm-slam"
     assert erfsfm.__file__ is not None and slam.__file__ is not None
     assert Path(erfsfm.__file__).parents[1] == Path(slam.__file__).parents[1]
 
 
-def test_git_ignores_no_source() -> None:
+def test_git_ignores_no_source():
     """A pattern such as ``results/`` would also keep ``slam/results/`` out of commits and out of the wheel."""
     command = ["git", "check-ignore", "--no-index", "--stdin"]
     listed = subprocess.run(
@@ -168,7 +168,7 @@ def test_git_ignores_no_source() -> None:
     assert listed.stdout == ""
 
 
-def test_every_configuration_loads_by_file_and_by_name() -> None:
+def test_every_configuration_loads_by_file_and_by_name():
     files = list((ROOT / "configs").rglob("*.yaml"))
     assert {path.parent.name for path in files} == set(LOADERS)
     assert not [
@@ -178,7 +178,7 @@ def test_every_configuration_loads_by_file_and_by_name() -> None:
     ]
 
 
-def test_no_tracked_text_names_a_place_on_one_machine() -> None:
+def test_no_tracked_text_names_a_place_on_one_machine():
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=False)
     if listed.returncode:
         pytest.skip("not a git checkout")

@@ -54,7 +54,7 @@ def _anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-def test_links_lead_to_pages_and_headings() -> None:
+def test_links_lead_to_pages_and_headings():
     lost = []
     for page, text in LINKED.items():
         for target, anchor in LINK.findall(text):
@@ -64,7 +64,7 @@ def test_links_lead_to_pages_and_headings() -> None:
     assert not lost
 
 
-def test_files_and_configuration_keys_that_are_named_exist() -> None:
+def test_files_and_configuration_keys_that_are_named_exist():
     strange = []
     paths = [
         f"/{path.relative_to(ROOT).as_posix()}"
@@ -88,7 +88,7 @@ def test_files_and_configuration_keys_that_are_named_exist() -> None:
     assert not strange
 
 
-def test_pages_that_code_names_exist() -> None:
+def test_pages_that_code_names_exist():
     missing = []
     for path in (each for kind in KINDS for each in (ROOT / kind).rglob("*")):
         if path.suffix in {".py", ".yaml", ".md", ".j2"}:
@@ -99,7 +99,7 @@ def test_pages_that_code_names_exist() -> None:
     assert not missing
 
 
-def test_the_index_and_the_site_have_every_page_once() -> None:
+def test_the_index_and_the_site_have_every_page_once():
     docs, index = ROOT / "docs", ROOT / "docs" / "README.md"
     listed = {(docs / target).resolve() for target, _ in LINK.findall(PAGES[index])}
     assert listed == {*DOCS, *docs.rglob("*.ipynb")} - {index}
@@ -112,7 +112,7 @@ def test_the_index_and_the_site_have_every_page_once() -> None:
     )
 
 
-def test_commands_that_are_named_exist() -> None:
+def test_commands_that_are_named_exist():
     """Commands within a sentence, often not whole; tests/integration/test_documentation.py reads the others."""
     strange = []
     for page, text in PAGES.items():

@@ -62,7 +62,7 @@ def licence_of(package: Distribution) -> str:
     )
 
 
-def test_every_installed_package_has_an_allowed_licence() -> None:
+def test_every_installed_package_has_an_allowed_licence():
     packages = installed()
     assert {"torch", "numpy", "gtsam", "pydantic"} <= set(packages)
     refused = {
@@ -72,7 +72,7 @@ def test_every_installed_package_has_an_allowed_licence() -> None:
     assert not refused, "add the licence to the list, or use another package"
 
 
-def test_every_installed_package_is_pinned() -> None:
+def test_every_installed_package_is_pinned():
     pins = {
         normalised(line.partition("==")[0])
         for line in (ROOT / "constraints.txt").read_text().splitlines()

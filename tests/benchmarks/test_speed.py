@@ -53,7 +53,7 @@ def cpu_ms() -> Clock:
     return measure
 
 
-def test_networks_forward_and_backward(cpu_ms: Clock) -> None:
+def test_networks_forward_and_backward(cpu_ms: Clock):
     image, sources = torch.rand(SIZE) * 2 - 1, [torch.rand(SIZE) * 2 - 1 for _ in range(4)]
     networks = {name: build(name) for pair in PAIRS for name in pair}
 
@@ -73,7 +73,7 @@ def test_networks_forward_and_backward(cpu_ms: Clock) -> None:
         print(f"| {depth} | {pose} | {cost:.0f} | {cost / costs[0]:.2f} |")
 
 
-def test_simulated_street(cpu_ms: Clock) -> None:
+def test_simulated_street(cpu_ms: Clock):
     from slam.simulation.options import SimulationOptions
     from slam.simulation.street import SimulatedStreet
 

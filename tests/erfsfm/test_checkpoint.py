@@ -51,7 +51,7 @@ def states(model: Model) -> list[torch.Tensor]:
 @pytest.mark.parametrize(
     "network", [{}, {"depth": "erf-depthnet-dfcv2", "pose": "erf-posenet-dfc", "fidelity": "paper"}]
 )
-def test_round_trip(tmp_path: Path, network: dict[str, Any]) -> None:
+def test_round_trip(tmp_path: Path, network: dict[str, Any]):
     model = fresh(**network)
     save_model(tmp_path, model)
     loaded = load_model(tmp_path)
@@ -61,7 +61,7 @@ def test_round_trip(tmp_path: Path, network: dict[str, Any]) -> None:
     assert not loaded.networks["pose"].training
 
 
-def test_half_precision(tmp_path: Path) -> None:
+def test_half_precision(tmp_path: Path):
     """Half the size, weights to three digits, the statistics of batch normalisation exact."""
     model = fresh()
     for name, value in model.networks["depth"].state_dict().items():
@@ -82,7 +82,7 @@ def test_half_precision(tmp_path: Path) -> None:
             torch.testing.assert_close(value, reference, rtol=1e-3, atol=1e-4)
 
 
-def test_missing_and_unknown_tensors(folder: Path) -> None:
+def test_missing_and_unknown_tensors(folder: Path):
     path = folder / "pose.safetensors"
     tensors = load_file(path)
     first = sorted(tensors)[0]
@@ -107,13 +107,13 @@ def test_missing_and_unknown_tensors(folder: Path) -> None:
         "\x00\x01",
     ],
 )
-def test_bad_record(folder: Path, text: str) -> None:
+def test_bad_record(folder: Path, text: str):
     (folder / "model.yaml").write_text(text)
     message = refusal(folder)
     assert "not a model record of format 1" in message or "is not YAML" in message
 
 
-def test_fingerprint_depends_on_both_files(folder: Path, tmp_path: Path) -> None:
+def test_fingerprint_depends_on_both_files(folder: Path, tmp_path: Path):
     before = weights_sha256(folder)
     assert len(before) == 64
     assert weights_sha256(shutil.copytree(folder, tmp_path / "copy")) == before

@@ -73,7 +73,7 @@ assert not heavy, heavy
 """
 
 
-def test_help_of_every_command_loads_no_heavy_library() -> None:
+def test_help_of_every_command_loads_no_heavy_library():
     finished = subprocess.run(
         [sys.executable, "-c", HELP], capture_output=True, text=True, check=False
     )
@@ -124,7 +124,7 @@ def test_errors_are_one_line(
     monkeypatch: pytest.MonkeyPatch,
     arguments: list[str],
     words: str,
-) -> None:
+):
     import erfsfm.model_record
 
     monkeypatch.setattr(erfsfm.model_record, "SHIPPED", tmp_path / "none")
@@ -141,7 +141,7 @@ def test_errors_are_one_line(
     assert words.format(**places) in err
 
 
-def test_networks_json(run: Run) -> None:
+def test_networks_json(run: Run):
     code, out, err = run("networks", "--json", "--fidelity", "paper")
     assert (code, err) == (0, "")
     rows: list[dict[str, Any]] = json.loads(out)
@@ -159,9 +159,7 @@ def test_networks_json(run: Run) -> None:
 
 
 @pytest.mark.slow
-def test_receptive_field(
-    run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]
-) -> None:
+def test_receptive_field(run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]):
     images = write_root(tmp_path / "root", frames=6) / "sequences/00/image_2"
     picture = tmp_path / "new/field.png"
     plainly = "--network erf-posenet-dilated --height 64 --width 96 --output"
@@ -180,7 +178,7 @@ def test_receptive_field(
 
 def test_predict_leaves_out_what_it_cannot_read(
     run: Run, tmp_path: Path, weights: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     images, depth = tmp_path / "images", tmp_path / "depth"
     images.mkdir()
     for name in ("a.png", "b.png", "c.jpg"):
@@ -197,7 +195,7 @@ def test_predict_leaves_out_what_it_cannot_read(
     assert np.load(depth / "a.npy").shape == (20, 30)
 
 
-def test_predict_does_not_overwrite_the_images(run: Run, tmp_path: Path, weights: Path) -> None:
+def test_predict_does_not_overwrite_the_images(run: Run, tmp_path: Path, weights: Path):
     cv2.imwrite(str(tmp_path / "a.png"), np.full((20, 30, 3), 99, np.uint8))
     before = (tmp_path / "a.png").read_bytes()
     code, _, err = run("predict", tmp_path, "--weights", weights, "--output", tmp_path)
@@ -209,7 +207,7 @@ def test_predict_does_not_overwrite_the_images(run: Run, tmp_path: Path, weights
 @pytest.mark.parametrize("suffixes", [[".npy"], [".png"]])
 def test_predict_replaces_earlier_predictions_alone(
     run: Run, tmp_path: Path, weights: Path, suffixes: list[str]
-) -> None:
+):
     cv2.imwrite(str(tmp_path / "a.png"), np.full((20, 30, 3), 99, np.uint8))
     depth = tmp_path / "depth"
     given = ["predict", tmp_path / "a.png", "--weights", weights, "--output", depth]
@@ -227,9 +225,7 @@ def test_predict_replaces_earlier_predictions_alone(
     assert {path.name: path.read_bytes() for path in depth.iterdir()} == before
 
 
-def test_evaluate_depth(
-    run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]
-) -> None:
+def test_evaluate_depth(run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]):
     root = write_root(tmp_path / "root", frames=6, depth=True, seed=600)
     code, out, err = run("evaluate", "depth", "--weights", weights, "--dataset", root, "--json")
     assert (code, err) == (0, "")
@@ -242,7 +238,7 @@ def test_evaluate_depth(
 
 def test_evaluate_refuses_a_leak(
     run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]
-) -> None:
+):
     root = write_root(tmp_path / "root", frames=6, depth=True, seed=17)
     for verb in (("depth",), ("pose", "--sequence", "00")):
         arguments = ("evaluate", *verb, "--weights", weights, "--dataset", root, "--json")
@@ -255,9 +251,7 @@ def test_evaluate_refuses_a_leak(
         assert any(row["leak"] is True for row in json.loads(out))
 
 
-def test_evaluate_pose(
-    run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]
-) -> None:
+def test_evaluate_pose(run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]):
     root = write_root(tmp_path / "root", frames=7, step=(0.0, 0.0, 0.1))
     code, out, _ = run(
         "evaluate", "pose", "--weights", weights, "--dataset", root, "--sequence", "00", "--json"
@@ -270,7 +264,7 @@ def test_evaluate_pose(
     assert networks["re_mean"] >= 0
 
 
-def test_train_and_resume(run: Run, tmp_path: Path, write_root: Callable[..., Path]) -> None:
+def test_train_and_resume(run: Run, tmp_path: Path, write_root: Callable[..., Path]):
     root = write_root(tmp_path / "root", frames=6, seed=3)
     arguments = [*TRAIN, *SMALL, "--dataset", root, "--output", tmp_path / "run"]
     small = "network.depth_width=0.0625 network.pose_width=0.125"
@@ -312,7 +306,7 @@ def refusal(command_line: Callable[..., tuple[int, str, str]]) -> Refusal:
 
 def test_images_of_mixed_size(
     refusal: Refusal, tmp_path: Path, write_root: WriteRoot, weights: Path
-) -> None:
+):
     root = write_root(tmp_path / "root", frames=5, size=(64, 96))
     odd = root / "sequences/00/image_2/000002.png"
     cv2.imwrite(str(odd), np.zeros((48, 96, 3), np.uint8))
@@ -326,7 +320,7 @@ def test_images_of_mixed_size(
 @pytest.mark.parametrize(("kind", "value"), [("depth", float("nan")), ("pose", float("inf"))])
 def test_weights_that_are_not_finite(
     refusal: Refusal, tmp_path: Path, write_root: WriteRoot, weights: Path, kind: str, value: float
-) -> None:
+):
     tensors = load_file(weights / f"{kind}.safetensors")
     next(iter(tensors.values())).view(-1)[0] = value
     save_file(tensors, weights / f"{kind}.safetensors")
@@ -342,7 +336,7 @@ def test_weights_that_are_not_finite(
     assert not (tmp_path / "depth").exists()
 
 
-def test_an_output_with_other_peoples_files(refusal: Refusal, tmp_path: Path) -> None:
+def test_an_output_with_other_peoples_files(refusal: Refusal, tmp_path: Path):
     files = {"config.yaml": dump_yaml(load_experiment("tiny")), "notes.txt": "mine"}
     output = tmp_path / "mine"
     output.mkdir()

@@ -48,7 +48,7 @@ def data(shared: Path, write_root: Callable[..., Path]) -> list[Path]:
     return roots
 
 
-def test_weights_have_the_name_of_the_configuration_that_trains_them() -> None:
+def test_weights_have_the_name_of_the_configuration_that_trains_them():
     for path in SHIPPED.glob("*/model.yaml"):
         record = load_model(path.parent.name).record
         assert record.network == load_experiment(path.parent.name).network
@@ -61,7 +61,7 @@ def test_it_starts(
     measure: Callable[..., None],
     command_line: Callable[..., Any],
     tmp_path: Path,
-) -> None:
+):
     written = load_experiment(configuration)
     words = "training.batch=2 training.steps=1 data.workers=0 data.cache_mb=50"
     words += f" data.validation=[simulated/500] teacher.cache={tmp_path / 'measured'}"
@@ -91,20 +91,20 @@ def test_it_starts(
 FILES = sorted((Path(__file__).parents[2] / "configs" / "erfsfm").glob("table*.yaml"))
 
 
-def test_the_guide_names_them_all() -> None:
+def test_the_guide_names_them_all():
     guide = (FILES[0].parents[2] / "docs" / "design" / "reproduction.md").read_text()
     assert set(re.findall(r"^\| `(table[123]-.+?)`", guide, re.MULTILINE)) == {
         path.stem for path in FILES
     }
 
 
-def test_the_beginning_of_a_name_lists_all_that_begin_so() -> None:
+def test_the_beginning_of_a_name_lists_all_that_begin_so():
     with pytest.raises(ConfigError) as caught:
         load_experiment("table1")
     assert all((path.stem in str(caught.value)) == path.stem.startswith("table1") for path in FILES)
 
 
-def test_a_file_has_the_experiment_of_its_name() -> None:
+def test_a_file_has_the_experiment_of_its_name():
     for path in FILES:
         experiment = load_experiment(path)
         network, loss, training, data = (
@@ -128,14 +128,14 @@ def test_a_file_has_the_experiment_of_its_name() -> None:
         assert {"kitti_odometry/09", "kitti_odometry/10", "eigen"} == set(data.exclude)
 
 
-def test_round_trip(tmp_path: Path) -> None:
+def test_round_trip(tmp_path: Path):
     for path in FILES[0].parent.glob("*.yaml"):
         config = load_experiment(path, ["data.roots=[/a/b, c]", "initial_weights=sim"])
         (tmp_path / "experiment.yaml").write_text(dump_yaml(config))
         assert load_experiment(tmp_path / "experiment.yaml") == config
 
 
-def test_defaults_are_the_papers() -> None:
+def test_defaults_are_the_papers():
     config = load_experiment(None)
     assert config == ExperimentConfig()
     assert config.network.sources == 4

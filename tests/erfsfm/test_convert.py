@@ -159,7 +159,7 @@ def refusal(*files: Path, output: Path | None = None, dilated: bool = False) -> 
     ("preset", "deformable"),
     [("depthnet", PLAIN), ("erf-depthnet-dfc", {1, 2, 3, 4}), ("erf-depthnet-dfcv2", {4, 5, 6, 7})],
 )
-def test_depth(tmp_path: Path, pose_file: Path, preset: str, deformable: frozenset[int]) -> None:
+def test_depth(tmp_path: Path, pose_file: Path, preset: str, deformable: frozenset[int]):
     old = OldDisp(frozenset(deformable)).eval()
     convert([save(old, tmp_path / "disp.pth.tar"), pose_file], tmp_path / "new")
     model = load_model(tmp_path / "new")
@@ -193,7 +193,7 @@ def test_pose(
     dilated: frozenset[int],
     masks: bool,
     sources: int,
-) -> None:
+):
     old = OldPose(frozenset(deformable), dilated, sources, masks).eval()
     convert([save(old, tmp_path / "pose.pth.tar")], tmp_path / "new", dilated=bool(dilated))
     model = load_model(tmp_path / "new")
@@ -207,7 +207,7 @@ def test_pose(
         )
 
 
-def test_the_record(tmp_path: Path, depth_file: Path, pose_file: Path) -> None:
+def test_the_record(tmp_path: Path, depth_file: Path, pose_file: Path):
     convert(
         [pose_file, depth_file],
         tmp_path / "new",
@@ -226,7 +226,7 @@ def test_the_record(tmp_path: Path, depth_file: Path, pose_file: Path) -> None:
     assert load_model(tmp_path / "unknown").record.trained_on == ["unknown"]
 
 
-def test_one_network_alone(tmp_path: Path, depth_file: Path) -> None:
+def test_one_network_alone(tmp_path: Path, depth_file: Path):
     convert([depth_file], tmp_path / "new")
     assert sorted(p.name for p in (tmp_path / "new").iterdir()) == [
         "depth.safetensors",
@@ -252,7 +252,7 @@ class Malicious:
 
 
 @pytest.mark.parametrize("form", ["zip", "legacy", "pickle", "hidden"])
-def test_nothing_is_executed(tmp_path: Path, form: str) -> None:
+def test_nothing_is_executed(tmp_path: Path, form: str):
     path, trace = tmp_path / "evil.pth.tar", tmp_path / "trace"
     state: dict[str, object] = dict(OldDisp().state_dict())
     if form == "pickle":
@@ -283,7 +283,7 @@ def _edited(path: Path, **changes: Tensor | None) -> Path:
     return path
 
 
-def test_other_networks(tmp_path: Path, depth_file: Path, pose_file: Path) -> None:
+def test_other_networks(tmp_path: Path, depth_file: Path, pose_file: Path):
     torch.save({"encoder.conv1.weight": torch.zeros(1)}, tmp_path / "resnet.pth.tar")
     assert "neither DispNetS nor PoseExpNet" in refusal(tmp_path / "resnet.pth.tar")
     assert "both hold a depth network" in refusal(depth_file, depth_file)

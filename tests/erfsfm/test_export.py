@@ -61,7 +61,7 @@ def onnx_output(path: Path, **inputs: torch.Tensor) -> np.ndarray:
     ],
     ids=str,
 )
-def test_all_presets(tmp_path: Path, depth: str, pose: str, settings: dict[str, Any]) -> None:
+def test_all_presets(tmp_path: Path, depth: str, pose: str, settings: dict[str, Any]):
     model = fresh(depth=depth, pose=pose, **settings)
     export_onnx(model, tmp_path / "net.onnx")
     written = export_onnx(model, tmp_path / "net.onnx")  # its own files are replaced
@@ -88,7 +88,7 @@ def test_all_presets(tmp_path: Path, depth: str, pose: str, settings: dict[str, 
     np.testing.assert_allclose(found, vectors, atol=1e-4 * float(vectors.abs().max()))
 
 
-def test_a_file_that_nobody_named_is_not_replaced(tmp_path: Path) -> None:
+def test_a_file_that_nobody_named_is_not_replaced(tmp_path: Path):
     pose_path(tmp_path / "net.onnx").write_text("another network")
     with pytest.raises(ExportError, match=r"net_pose\.onnx is none of ours"):
         export_onnx(fresh(), tmp_path / "net.onnx")
@@ -102,7 +102,7 @@ def test_a_file_that_nobody_named_is_not_replaced(tmp_path: Path) -> None:
         *(pytest.param(f"erf-posenet-{n}", marks=pytest.mark.slow) for n in ("dfc", "dfcv2")),
     ],
 )
-def test_paper_fidelity(tmp_path: Path, pose: str) -> None:
+def test_paper_fidelity(tmp_path: Path, pose: str):
     model = fresh(pose=pose, fidelity="paper", width=160, height=128)
     export_onnx(Model(model.record, {"pose": model.networks["pose"]}), tmp_path / "net.onnx")
     assert pose_path(tmp_path / "net.onnx").is_file()

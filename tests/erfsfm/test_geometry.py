@@ -31,7 +31,7 @@ def project(camera: Camera, points: np.ndarray) -> np.ndarray:
     return homogeneous[:, :2] / homogeneous[:, 2:]
 
 
-def test_the_paper_resizes_without_half_pixels() -> None:
+def test_the_paper_resizes_without_half_pixels():
     """Camera 2 of KITTI 00: the reference has cx 607.1928 * 416 / 1241."""
     kitti = Camera(1241, 376, 718.856, 718.856, 607.1928, 185.2157)
     paper = kitti.resized(416, 128, "paper")
@@ -43,13 +43,13 @@ def test_the_paper_resizes_without_half_pixels() -> None:
 
 
 @pytest.mark.parametrize("size", [(416, 128), (200, 240), (33, 7)])
-def test_project_then_resize(size: tuple[int, int]) -> None:
+def test_project_then_resize(size: tuple[int, int]):
     scale = np.array([size[0] / CAMERA.width, size[1] / CAMERA.height])
     expected = (project(CAMERA, POINTS) + 0.5) * scale - 0.5
     np.testing.assert_allclose(project(CAMERA.resized(*size), POINTS), expected, atol=1e-4)
 
 
-def test_project_then_crop() -> None:
+def test_project_then_crop():
     cropped = CAMERA.cropped(17, 5, 100, 80)
     assert (cropped.width, cropped.height) == (100, 80)
     np.testing.assert_allclose(
@@ -57,7 +57,7 @@ def test_project_then_crop() -> None:
     )
 
 
-def test_project_then_flip() -> None:
+def test_project_then_flip():
     pixels = project(CAMERA, POINTS)
     mirrored = POINTS * [-1, 1, 1]
     np.testing.assert_allclose(
@@ -67,7 +67,7 @@ def test_project_then_flip() -> None:
     )
 
 
-def test_scale_intrinsics_of_the_paper() -> None:
+def test_scale_intrinsics_of_the_paper():
     """Both rows by the height ratio, no half pixel: 75 x 248 at the third level is 10 x 31."""
     K = torch.tensor([[[200.0, 0, 124], [0, 210, 37], [0, 0, 1]]])
     level = scale_intrinsics(K, (10, 31), (75, 248), "paper")[0]
@@ -82,7 +82,7 @@ def test_scale_intrinsics_of_the_paper() -> None:
     )
 
 
-def test_backproject_undoes_project() -> None:
+def test_backproject_undoes_project():
     depth = torch.rand(2, 1, 5, 7).double() + 1
     K = torch.from_numpy(CAMERA.resized(7, 5).K).double().expand(2, 3, 3)
     homogeneous = K @ backproject(depth, K)
@@ -95,13 +95,13 @@ ANGLES = [0.0, 1e-8, 1e-3, 1.0, math.pi / 2, math.pi - 1e-6, math.pi, 2 * math.p
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_euler_is_scipys_intrinsic_xyz(angle: float) -> None:
+def test_euler_is_scipys_intrinsic_xyz(angle: float):
     euler = torch.tensor([angle, 0.3 - angle, 0.7 * angle], dtype=torch.float64)
     expected = torch.from_numpy(Rotation.from_euler("XYZ", euler.numpy()).as_matrix())
     torch.testing.assert_close(euler_to_rotation(euler), expected, rtol=0, atol=1e-14)
 
 
-def test_a_pose_rotates_then_translates() -> None:
+def test_a_pose_rotates_then_translates():
     T_a_b = pose_vector_to_matrix(torch.tensor([[1.0, 0.0, 0.0, 0.0, 0.0, math.pi / 2]]).double())
     point_b = torch.tensor([1.0, 0.0, 5.0, 1.0]).double()
     torch.testing.assert_close(T_a_b[0] @ point_b, torch.tensor([1.0, 1.0, 5.0, 1.0]).double())
@@ -116,7 +116,7 @@ def moved(*translation: float) -> Tensor:
 
 
 @pytest.mark.parametrize("size", [(128, 416), (75, 248), (94, 310), (33, 47)])
-def test_identity_returns_the_image_with_its_border(size: tuple[int, int]) -> None:
+def test_identity_returns_the_image_with_its_border(size: tuple[int, int]):
     image = torch.rand(1, 3, *size)
     depth = torch.rand(1, 1, *size) * 90 + 0.1
     K = torch.tensor(
@@ -128,7 +128,7 @@ def test_identity_returns_the_image_with_its_border(size: tuple[int, int]) -> No
 
 
 @pytest.mark.parametrize("shift", [1, 3, -2])
-def test_sideways_motion_shifts_a_plane_by_whole_pixels(shift: int) -> None:
+def test_sideways_motion_shifts_a_plane_by_whole_pixels(shift: int):
     """A plane at 5 m, focal length 50: the source sees its points ``50 t / 5`` pixels further right."""
     width, height = 40, 20
     image = torch.rand(1, 3, height, width)
@@ -143,7 +143,7 @@ def test_sideways_motion_shifts_a_plane_by_whole_pixels(shift: int) -> None:
     torch.testing.assert_close(warped[..., inside], expected[..., inside], rtol=0, atol=1e-4)
 
 
-def test_forward_motion_by_hand() -> None:
+def test_forward_motion_by_hand():
     """A point 10 m ahead is 8 m ahead of a source camera 2 m further on: T_source_target has t_z = -2."""
     grid, _ = project_into_source(torch.full((1, 1, 21, 41), 10.0), moved(0, 0, -2), camera(41, 21))
     # a pixel 8 right of the centre moves to 8 * 10 / 8 = 10 right of it
@@ -151,7 +151,7 @@ def test_forward_motion_by_hand() -> None:
     assert float(grid[0, 10, 28, 1]) == pytest.approx(0, abs=1e-6)
 
 
-def test_points_behind_the_camera_are_invalid() -> None:
+def test_points_behind_the_camera_are_invalid():
     depth = torch.full((1, 1, 11, 11), 3.0)
     assert not project_into_source(depth, moved(0, 0, -5), camera(11, 11))[1].any()
     assert not project_into_source(depth, moved(0, 0, -3), camera(11, 11))[1].any(), (
@@ -160,7 +160,7 @@ def test_points_behind_the_camera_are_invalid() -> None:
 
 
 @pytest.mark.parametrize("bad", [float("inf"), float("nan"), 1e30])
-def test_extreme_depth_gives_finite_values(bad: float) -> None:
+def test_extreme_depth_gives_finite_values(bad: float):
     image = torch.rand(1, 3, 8, 8)
     depth = torch.full((1, 1, 8, 8), bad)
     grid, _ = project_into_source(depth, moved(1e5, 0, 0), camera(8, 8))

@@ -60,7 +60,7 @@ def echo(sources: Literal[2, 4] = 4) -> tuple[DepthPosePredictor, Echo]:
     return DepthPosePredictor.of(Model(model(sources).record, {"depth": net, "pose": net})), net
 
 
-def test_networks_see_rgb_from_minus_one_to_one() -> None:
+def test_networks_see_rgb_from_minus_one_to_one():
     predictor, net = echo()
     red = np.zeros((32, 64, 3), np.uint8)
     red[..., 0] = 255
@@ -70,7 +70,7 @@ def test_networks_see_rgb_from_minus_one_to_one() -> None:
     np.testing.assert_allclose(depth, 1 / 1.1, rtol=1e-6)
 
 
-def test_disparity_is_what_is_interpolated() -> None:
+def test_disparity_is_what_is_interpolated():
     predictor, _ = echo()
     split = np.zeros((32, 64, 3), np.uint8)
     split[:, 32:, 0] = 255
@@ -84,7 +84,7 @@ def flat(value: int) -> NDArray[np.uint8]:
 
 
 @pytest.mark.parametrize("sources", [2, 4])
-def test_rows_follow_the_sources_in_time_order(sources: int) -> None:
+def test_rows_follow_the_sources_in_time_order(sources: int):
     predictor, net = echo(sources)
     values = [51 * k for k in range(sources + 1)]
     T_source_target = predictor.poses([flat(value) for value in values])
@@ -93,7 +93,7 @@ def test_rows_follow_the_sources_in_time_order(sources: int) -> None:
     np.testing.assert_allclose(T_source_target[:, 0, 3], [v / 127.5 - 1 for v in values], atol=1e-6)
 
 
-def test_a_single_image_may_be_seen_at_another_size_than_in_training() -> None:
+def test_a_single_image_may_be_seen_at_another_size_than_in_training():
     larger = DepthInput(height=64, width=128, disparity=0.5)
     plain = model()
     record = plain.record.model_copy(update={"depth_input": larger})
@@ -106,7 +106,7 @@ def test_a_single_image_may_be_seen_at_another_size_than_in_training() -> None:
     assert predictor.disparity(large).shape == (32, 64)
 
 
-def test_a_prepared_image_gives_the_bytes_of_the_image(predictor: DepthPosePredictor) -> None:
+def test_a_prepared_image_gives_the_bytes_of_the_image(predictor: DepthPosePredictor):
     frames = [image() for _ in range(5)]
     prepared = [predictor.prepare(frame) for frame in frames]
     assert prepared[0].shape == (1, 3, 32, 64)
@@ -116,7 +116,7 @@ def test_a_prepared_image_gives_the_bytes_of_the_image(predictor: DepthPosePredi
     np.testing.assert_array_equal(predictor.poses(mixed), predictor.poses(frames))
 
 
-def test_onnx_runtime_has_the_same_outputs_up_to_rounding(tmp_path: Path) -> None:
+def test_onnx_runtime_has_the_same_outputs_up_to_rounding(tmp_path: Path):
     frames = [image() for _ in range(5)]
     save_model(tmp_path, model())
     plain = DepthPosePredictor.from_weights(tmp_path)
@@ -126,7 +126,7 @@ def test_onnx_runtime_has_the_same_outputs_up_to_rounding(tmp_path: Path) -> Non
         np.testing.assert_allclose(fast.poses(frames), plain.poses(frames), atol=1e-4)
 
 
-def test_kept_graphs_need_no_torch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kept_graphs_need_no_torch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     save_model(tmp_path / "weights", model())
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     predictor = DepthPosePredictor.from_weights(tmp_path / "weights", runtime="onnx")
@@ -145,7 +145,7 @@ print(predictor.depth(grey).sum(), predictor.poses([grey] * 5).sum(), "torch" in
     assert second == [*first, "False"]
 
 
-def test_from_weights(tmp_path: Path) -> None:
+def test_from_weights(tmp_path: Path):
     made = model()
     save_model(tmp_path, made)
     loaded = DepthPosePredictor.from_weights(tmp_path)
@@ -156,7 +156,7 @@ def test_from_weights(tmp_path: Path) -> None:
     assert DepthPosePredictor.from_weights(str(tmp_path)).record == loaded.record
 
 
-def test_leaks(predictor: DepthPosePredictor) -> None:
+def test_leaks(predictor: DepthPosePredictor):
     names = [
         "kitti_odometry/00[249:260]",
         "kitti_odometry/00[250:260]",

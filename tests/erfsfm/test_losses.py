@@ -38,7 +38,7 @@ def naive_dissimilarity(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return out
 
 
-def test_dissimilarity_matches_a_naive_reference() -> None:
+def test_dissimilarity_matches_a_naive_reference():
     first, second = torch.rand(2, 2, 3, 6, 7, dtype=torch.float64)
     result = dissimilarity(first, second)
     for batch in range(2):
@@ -49,7 +49,7 @@ def test_dissimilarity_matches_a_naive_reference() -> None:
             np.testing.assert_allclose(result[batch, channel].numpy(), expected, atol=1e-12)
 
 
-def test_ssim_of_flat_images_by_hand() -> None:
+def test_ssim_of_flat_images_by_hand():
     """Without structure the luminance alone counts: (2ab + C1) / (a^2 + b^2 + C1)."""
     a, b = 0.2, 0.8
     target, warped = torch.full((1, 3, 4, 5), a).double(), torch.full((1, 3, 4, 5), b).double()
@@ -58,7 +58,7 @@ def test_ssim_of_flat_images_by_hand() -> None:
     torch.testing.assert_close(photometric_error(target, warped, 0.85), expected)
 
 
-def test_gradient() -> None:
+def test_gradient():
     target = torch.rand(1, 3, 4, 5, dtype=torch.float64)
     warped = torch.rand(1, 3, 4, 5, dtype=torch.float64, requires_grad=True)
 
@@ -68,7 +68,7 @@ def test_gradient() -> None:
     assert torch.autograd.gradcheck(error, (warped,))
 
 
-def test_gradient_at_equal_images_is_finite() -> None:
+def test_gradient_at_equal_images_is_finite():
     image = torch.rand(1, 3, 5, 5)
     warped = image.clone().requires_grad_()
     photometric_error(image, warped, 0.85).sum().backward()
@@ -82,20 +82,20 @@ def ramp(height: int, width: int) -> torch.Tensor:
     return (1.0 + 2 * u + 3 * v)[None, None]
 
 
-def test_a_parabola_by_hand() -> None:
+def test_a_parabola_by_hand():
     """u^2 has a second difference of 2 along u, nothing else."""
     u = torch.arange(9.0)
     assert float(second_order_smoothness((u**2).expand(1, 1, 5, 9))) == pytest.approx(2)
 
 
-def test_one_spike_by_hand() -> None:
+def test_one_spike_by_hand():
     values = torch.zeros(1, 1, 5, 5)
     values[0, 0, 2, 2] = 1
     # along each axis -1 2 -1 over 5 x 3 places; mixed four ones over 4 x 4, twice
     assert float(second_order_smoothness(values)) == pytest.approx(2 * 4 / 15 + 2 * 4 / 16)
 
 
-def test_edge_aware_by_hand() -> None:
+def test_edge_aware_by_hand():
     """A ramp 1, 2, 3 of mean 2 has normalised steps of 1/2; an edge of 1 in all colours damps by e^-1."""
     values = torch.tensor([[1.0, 2.0, 3.0]] * 2)[None, None]
     flat = torch.zeros(1, 3, 2, 3)

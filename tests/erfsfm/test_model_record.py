@@ -32,7 +32,7 @@ def trained(small: Small, root: Path, output: Path, **data: Any) -> DepthPosePre
 
 def test_a_raw_drive_leaks_into_its_odometry_sequence(
     tmp_path: Path, small: Small, write_raw: Callable[..., Path], write_root: Callable[..., Path]
-) -> None:
+):
     """2011_09_30_drive_0033 is sequence 09; the car stands in its frames 6 and 7, which are not recorded as seen."""
     write_raw(tmp_path / "raw", drive="2011_09_30_drive_0033", speeds=[9] * 6 + [0, 0] + [9] * 5)
     networks = trained(small, tmp_path / "raw", tmp_path / "run", exclude=[])
@@ -57,7 +57,7 @@ def test_a_raw_drive_leaks_into_its_odometry_sequence(
 
 def test_an_odometry_sequence_leaks_into_the_eigen_list(
     tmp_path: Path, small: Small, write_root: Callable[..., Path]
-) -> None:
+):
     """Sequence 00 is 2011_10_03_drive_0027, whose frame 0 is Eigen's: refused before an image is looked for."""
     networks = trained(small, write_root(tmp_path / "odometry"), tmp_path / "run")
     assert read_record(tmp_path / "run" / "model.yaml").trained_on == ["kitti_odometry/00[0:8]"]

@@ -71,7 +71,7 @@ TURNS = np.array([[0.1, -2.0, 0.1], [0.0, -1.5, 0.2], [0.2, 0.5, 0.0], [0.0, 1.0
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-def test_a_wrong_guess_is_mended_for_any_camera(camera: Pinhole) -> None:
+def test_a_wrong_guess_is_mended_for_any_camera(camera: Pinhole):
     true = steady(TURNS, TRAVEL)
     guess = steady(0.3 * TURNS, TRAVEL + np.array([0.03, 0.02, 0.0]))  # two degrees aside
     turn, direction = errors_deg(
@@ -80,13 +80,13 @@ def test_a_wrong_guess_is_mended_for_any_camera(camera: Pinhole) -> None:
     assert turn < 0.05 and direction < 0.3
 
 
-def test_another_camera_is_another_motion() -> None:
+def test_another_camera_is_another_motion():
     """What the constant camera of a network would make of it: turns by the quotient of the focal lengths."""
     true, steps = steady(TURNS, TRAVEL), corners(steady(TURNS, TRAVEL), CAMERAS[1])
     assert errors_deg(measured(sources(true), steps, KITTI), sources(true))[0] > 1
 
 
-def test_corners_that_move_by_themselves_do_not_count() -> None:
+def test_corners_that_move_by_themselves_do_not_count():
     true, rng = steady(TURNS, TRAVEL), np.random.default_rng(1)
     steps = [
         each._replace(after=each.after + 8 * (rng.random((200, 1)) < 0.25))
@@ -98,19 +98,19 @@ def test_corners_that_move_by_themselves_do_not_count() -> None:
     assert turn < 0.05 and direction < 0.3
 
 
-def test_the_length_is_that_of_the_guess() -> None:
+def test_the_length_is_that_of_the_guess():
     true = steady(TURNS, TRAVEL)
     found = measured(sources(steady(TURNS, 0.1 * TRAVEL)), corners(true, KITTI), KITTI)
     np.testing.assert_allclose(found[:, :3, 3], 0.1 * sources(true)[:, :3, 3], atol=1e-3)
 
 
-def test_without_corners_the_guess_stays() -> None:
+def test_without_corners_the_guess_stays():
     guess = steady(TURNS, TRAVEL)
     nothing = [each._replace(known=np.zeros(200, bool)) for each in corners(guess, KITTI)]
     np.testing.assert_allclose(measured(sources(guess), nothing, KITTI), sources(guess), atol=1e-9)
 
 
-def test_a_camera_that_stands_keeps_the_guessed_direction() -> None:
+def test_a_camera_that_stands_keeps_the_guessed_direction():
     still = steady(np.zeros((4, 3)), np.zeros(3))
     turn, direction = errors_deg(
         measured(sources(steady(TURNS, TRAVEL)), corners(still, KITTI, noise=0.05), KITTI),
@@ -142,7 +142,7 @@ def seen(turns_deg: Array, camera: Pinhole, seed: int = 0) -> list[NDArray[np.ui
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_turns_that_nobody_guessed_are_found_in_images(seed: int) -> None:
+def test_turns_that_nobody_guessed_are_found_in_images(seed: int):
     steps = [followed(a, b) for a, b in pairwise(seen(TURNS, KITTI, seed))]
     assert min(step.known.mean() for step in steps) > 0.5
     found = measured(np.tile(np.eye(4), (4, 1, 1)), steps, KITTI)
@@ -150,12 +150,12 @@ def test_turns_that_nobody_guessed_are_found_in_images(seed: int) -> None:
     assert np.abs(found[:, :3, 3]).max() == 0
 
 
-def test_blank_images_have_no_corners() -> None:
+def test_blank_images_have_no_corners():
     blank = np.full((128, 416), 90, np.uint8)
     assert not followed(blank, blank).known.any()
 
 
-def test_a_predictor_measures_with_the_camera_of_the_images() -> None:
+def test_a_predictor_measures_with_the_camera_of_the_images():
     config = NetworkConfig(depth_width=0.1, pose_width=0.1, alignment="images")
     networks = DepthPosePredictor.of(
         Model(ModelRecord(network=config, trained_on=[]), build_networks(config))

@@ -57,9 +57,7 @@ def check(run: RunFolder, measured: Measured) -> None:
 
 
 @pytest.mark.data
-def test_two_seconds_are_as_right_after_the_graph_as_before(
-    data_root: Path, tmp_path: Path
-) -> None:
+def test_two_seconds_are_as_right_after_the_graph_as_before(data_root: Path, tmp_path: Path):
     options = {"weights": "sim", "frames": "0:20", "overrides": QUICK, "output": tmp_path / "run"}
     found = run_slam(data_root / "kitti_odometry", "02", **options).metrics().tree()["trajectories"]
     before, after = (
@@ -71,7 +69,7 @@ def test_two_seconds_are_as_right_after_the_graph_as_before(
 @pytest.mark.data
 @pytest.mark.slow
 @pytest.mark.parametrize("measured", KITTI, ids=str)
-def test_kitti(data_root: Path, tmp_path: Path, measured: Measured) -> None:
+def test_kitti(data_root: Path, tmp_path: Path, measured: Measured):
     root = data_root / "kitti_odometry"
     run = run_slam(
         root, measured.sequence, weights=measured.weights, overrides=QUICK, output=tmp_path / "run"
@@ -81,7 +79,7 @@ def test_kitti(data_root: Path, tmp_path: Path, measured: Measured) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("measured", LOOP, ids=str)
-def test_the_embedded_loop(tmp_path: Path, measured: Measured) -> None:
+def test_the_embedded_loop(tmp_path: Path, measured: Measured):
     run = run_slam(weights=measured.weights, overrides=QUICK, output=tmp_path / "run")
     check(run, measured)
     assert run.metrics().tree()["loops"]["accepted"] > LOOPS_CLOSED / SLACK

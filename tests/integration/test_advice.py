@@ -90,7 +90,7 @@ def every_frame_of_a_camera(folder: Path) -> Case:
 )
 def test_advice_that_is_followed_helps(
     case: Callable[[Path], Case], tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     attempt, words, follow = case(tmp_path)
     try:
         attempt()

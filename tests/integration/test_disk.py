@@ -48,9 +48,7 @@ def run(kitti_root: Path, tiny_weights: Path, tmp_path: Path) -> list[str]:
     ]
 
 
-def test_a_run_on_a_full_disk_is_one_line(
-    run: list[str], command_line: Call, tmp_path: Path
-) -> None:
+def test_a_run_on_a_full_disk_is_one_line(run: list[str], command_line: Call, tmp_path: Path):
     with full_disk(200):
         code, _, err = command_line(slam_main, "erfsfm-slam", *run)
     said = [line for line in err.splitlines() if line.startswith("erfsfm-slam: ")]
@@ -61,7 +59,7 @@ def test_a_run_on_a_full_disk_is_one_line(
 
 def test_a_prediction_is_whole_or_absent(
     kitti_root: Path, tiny_weights: Path, command_line: Call, tmp_path: Path
-) -> None:
+):
     images, out = kitti_root / "sequences/sim/image_2", tmp_path / "depth"
     with full_disk(200):
         assert (

@@ -413,7 +413,7 @@ def remove_outputs(command: str) -> None:
 
 
 @pytest.mark.parametrize("block", [parameter(block) for block in RUNNABLE])
-def test_every_command_runs(block: Block, at_work: Path) -> None:
+def test_every_command_runs(block: Block, at_work: Path):
     command = shorter(block.text)
     if shlex.split(command)[0] not in PROGRAMS:
         pytest.fail(f"{block}: '{block.text}' starts no program that this test knows; {ADVICE}")
@@ -437,7 +437,7 @@ def understood(reader: Any, words: list[str]) -> None:
     reader.make_context(name, words)
 
 
-def test_every_command_is_understood() -> None:
+def test_every_command_is_understood():
     """Also where it is not run or is slow: its options exist, and their values are of the right kind."""
     readers: dict[str, Any] = {
         name: typer.main.get_command(app)
@@ -482,7 +482,7 @@ def cells_of_notebook() -> list[Any]:
 
 
 @pytest.mark.slow
-def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")
     names: dict[str, Any] = {}
@@ -508,7 +508,7 @@ def blocks(*languages: str) -> list[Block]:
 
 
 @pytest.mark.parametrize("block", [parameter(block) for block in blocks("python", "py")])
-def test_every_python_block_runs(block: Block, at_work: Path) -> None:
+def test_every_python_block_runs(block: Block, at_work: Path):
     names = stand_ins(at_work / "world")
     code = compile(
         "\n" * (block.line - 1) + block.text, str(block.document), "exec"
@@ -521,7 +521,7 @@ def test_every_python_block_runs(block: Block, at_work: Path) -> None:
 
 
 @pytest.mark.parametrize("block", blocks("yaml", "yml"), ids=str)
-def test_every_camera_file_opens(block: Block, tmp_path: Path) -> None:
+def test_every_camera_file_opens(block: Block, tmp_path: Path):
     camera = yaml.safe_load(block.text)
     assert "fx" in camera, f"{block}: this test reads camera.yaml only; add this kind of YAML"
     for k in range(6):

@@ -151,7 +151,7 @@ def check(recording: Recording, run: RunFolder) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(28))
-def test_a_run_ends(seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_ends(seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A failed stage, too, is an error here; the last ones are streams."""
     monkeypatch.setenv(SHOW_TRACEBACK, "1")
     recording, images, output = Recording.of(seed), tmp_path / "images", tmp_path / "run"

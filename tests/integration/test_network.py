@@ -14,7 +14,7 @@ import pytest
 from slam import run_slam
 
 
-def test_the_demo_runs_without_sockets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_demo_runs_without_sockets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def forbidden(*_: Any, **__: Any) -> NoReturn:
         raise AssertionError("a socket was opened")
 
@@ -27,7 +27,7 @@ def test_the_demo_runs_without_sockets(tmp_path: Path, monkeypatch: pytest.Monke
     assert run.metrics().tree()["status"] == "ok" and (run.path / "report.html").is_file()
 
 
-def test_onnx_runtime_keeps_nothing_to_report(tmp_path: Path) -> None:
+def test_onnx_runtime_keeps_nothing_to_report(tmp_path: Path):
     """Unless told not to, it reports to its maker, by an identifier that it keeps in the home folder."""
     environment = {
         name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"

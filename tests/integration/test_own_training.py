@@ -19,9 +19,7 @@ SMALL_DATA = ("workers=0", "validation_share=0.45")
 
 
 @pytest.mark.slow
-def test_own_fine_tunes_default_on_any_drive(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_own_fine_tunes_default_on_any_drive(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     street = SimulatedStreet(SimulationOptions("straight", 44, 77))
     write_kitti_root(street, tmp_path / "drive")
     settings = [f"training.{each}" for each in SMALL] + [f"data.{each}" for each in SMALL_DATA]

@@ -339,7 +339,7 @@ def check_line(line: str, path: Path, place: Path) -> None:
 @pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
 def test_a_damaged_file_is_read_or_refused_in_one_line(
     reader: Reader, readable: Path, tmp_path: Path
-) -> None:
+):
     @FEW
     @given(damaged(readable.read_bytes()))
     def hold(content: bytes) -> None:
@@ -357,9 +357,7 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(
 
 
 @pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
-def test_a_folder_in_the_place_of_a_file_is_refused(
-    reader: Reader, readable: Path, tmp_path: Path
-) -> None:
+def test_a_folder_in_the_place_of_a_file_is_refused(reader: Reader, readable: Path, tmp_path: Path):
     readable.unlink()
     readable.mkdir()
     with pytest.raises((SlamError, ErfsfmError)) as raised:

@@ -21,7 +21,7 @@ TRAJECTORY_ALONE = ("mapping.enabled=false", "output.report=false")
 @pytest.mark.slow
 def test_forty_frames_of_kitti(
     data_root: Path, tmp_path: Path, check_run: Callable[[Path], dict[str, Any]]
-) -> None:
+):
     run = run_slam(
         data_root / "kitti_odometry", "00", frames="0:40", output=tmp_path / "run", device="cpu"
     )
@@ -46,7 +46,7 @@ def test_forty_frames_of_kitti(
 )
 def test_a_drive_at_full_size(
     root: str, frames: str | None, align: str, most_m: float, data_root: Path, tmp_path: Path
-) -> None:
+):
     options = {"output": tmp_path / "run", "device": "cpu", "overrides": TRAJECTORY_ALONE}
     run = run_slam(data_root / root, frames=frames, **options)
     optimised = run.metrics().tree()["trajectories"]["optimised"]
@@ -55,7 +55,7 @@ def test_a_drive_at_full_size(
 
 @pytest.mark.data
 @pytest.mark.slow
-def test_images_beside_the_map_of_a_kitchen_are_localised(data_root: Path, tmp_path: Path) -> None:
+def test_images_beside_the_map_of_a_kitchen_are_localised(data_root: Path, tmp_path: Path):
     """Learned depth of a room is wrong by half, so only triangulated points can tell where an image was taken."""
     images, poses = (
         data_root / "handheld_kitchen" / "images",
@@ -87,7 +87,7 @@ def test_images_beside_the_map_of_a_kitchen_are_localised(data_root: Path, tmp_p
 @pytest.mark.slow
 def test_the_map_of_a_drive_against_its_scans(
     data_root: Path, tmp_path: Path, check_run: Callable[[Path], dict[str, Any]]
-) -> None:
+):
     drive = data_root / "kitti_raw" / "2011_09_26" / "2011_09_26_drive_0013_sync"
     run = run_slam(drive, frames="0:60", output=tmp_path / "run", device="cpu")
     found = check_run(run.path)["map"]

@@ -17,7 +17,7 @@ MOST_SPREAD = 1.5  # of the worst seed over the mean: more is a fault, however g
 
 
 @pytest.mark.slow
-def test_seeds_on_the_simulated_street(tmp_path: Path) -> None:
+def test_seeds_on_the_simulated_street(tmp_path: Path):
     def run(name: str, seed: int) -> RunFolder:
         options = {"frames": "20:45", "weights": "sim", "overrides": QUICK, "device": "cpu"}
         return run_slam(output=tmp_path / name, seed=seed, **options)
@@ -38,9 +38,7 @@ def test_seeds_on_the_simulated_street(tmp_path: Path) -> None:
     ("recording", "mean_m"),
     [("handheld_walk", 0.087), ("handheld_kitchen", 0.0258), ("failures/tum_cabinet", 0.153)],
 )
-def test_seeds_of_a_carried_camera(
-    recording: str, mean_m: float, data_root: Path, tmp_path: Path
-) -> None:
+def test_seeds_of_a_carried_camera(recording: str, mean_m: float, data_root: Path, tmp_path: Path):
     """The mean of three seeds as measured, and the worst of them: one seed alone measures luck."""
     root, errors = data_root / recording, []
     for seed in SEEDS:
@@ -60,7 +58,7 @@ def test_seeds_of_a_carried_camera(
 
 @pytest.mark.slow
 @pytest.mark.data
-def test_over_a_bridge_of_repeating_kerbs_a_car_goes_on(data_root: Path, tmp_path: Path) -> None:
+def test_over_a_bridge_of_repeating_kerbs_a_car_goes_on(data_root: Path, tmp_path: Path):
     video = data_root / "dashcams/mumbai.mp4"
     run = run_slam(video, camera="fov=65", output=tmp_path, overrides=QUICK)
     motion = run.metrics().motion

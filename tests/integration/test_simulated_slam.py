@@ -78,7 +78,7 @@ def round_trip(street: Rendered) -> Estimate:
 
 
 @pytest.mark.slow
-def test_image_geometry_and_graph_reduce_the_error_of_the_network(round_trip: Estimate) -> None:
+def test_image_geometry_and_graph_reduce_the_error_of_the_network(round_trip: Estimate):
     assert len(round_trip.optimised) == 250
     sources = [motion.relative_pose.source for motion in round_trip.drive.steps.values()]
     assert sources.count(ESSENTIAL_SOURCE) > 200
@@ -90,7 +90,7 @@ def test_image_geometry_and_graph_reduce_the_error_of_the_network(round_trip: Es
 
 
 @pytest.mark.slow
-def test_the_camera_height_gives_metres(round_trip: Estimate) -> None:
+def test_the_camera_height_gives_metres(round_trip: Estimate):
     estimate = round_trip.scale.estimate
     assert round_trip.scale.mode == "camera-height" and not isinstance(estimate, Failed)
     assert estimate.value * FACTOR == pytest.approx(1.0, rel=0.03)
@@ -99,7 +99,7 @@ def test_the_camera_height_gives_metres(round_trip: Estimate) -> None:
 
 
 @pytest.mark.slow
-def test_the_map_lies_on_the_street(street: Rendered, round_trip: Estimate) -> None:
+def test_the_map_lies_on_the_street(street: Rendered, round_trip: Estimate):
     assert round_trip.map is not None and round_trip.reference is not None
     points = round_trip.map.cloud().points[::7]
     assert len(points) > 10_000
@@ -111,7 +111,7 @@ def test_the_map_lies_on_the_street(street: Rendered, round_trip: Estimate) -> N
 
 
 @pytest.mark.slow
-def test_without_noise_the_map_is_as_good_as_its_voxels(street: Rendered) -> None:
+def test_without_noise_the_map_is_as_good_as_its_voxels(street: Rendered):
     part = street.cut(40, 70)
     oracle = OraclePredictor(part.reference, part.depth)
     exact = ["visual_odometry.enabled=false", "depth.refine=none"]  # true depth is the better one
@@ -137,7 +137,7 @@ def steps(path: Path) -> FloatArray:
 @pytest.mark.slow
 def test_rotations_of_the_shipped_networks_follow_the_road(
     learned: Path, check_run: Callable[[Path], dict[str, Any]]
-) -> None:
+):
     metrics = check_run(learned)
     assert metrics["provenance"]["leak"] is False
     network, truth = (
@@ -152,7 +152,7 @@ def test_rotations_of_the_shipped_networks_follow_the_road(
 @pytest.mark.slow
 def test_the_system_is_better_than_its_networks(
     learned: Path, check_run: Callable[[Path], dict[str, Any]]
-) -> None:
+):
     metrics = check_run(learned)
     errors = {
         name: metrics["trajectories"][name]["align"]
@@ -171,7 +171,7 @@ def test_the_system_is_better_than_its_networks(
 @pytest.mark.slow
 def test_the_map_of_a_simulated_root_on_disk_has_an_error(
     tmp_path: Path, check_run: Callable[[Path], dict[str, Any]]
-) -> None:
+):
     street = SimulatedSequence(SimulationOptions("straight", frames=40, seed=703)).street
     write_kitti_root(street, tmp_path / "root", depth=True)
     run = run_slam(tmp_path / "root", weights="sim", output=tmp_path / "run", device="cpu")

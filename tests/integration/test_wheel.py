@@ -104,7 +104,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     return Installed(sdist, wheel, environment)
 
 
-def test_the_wheel_holds_the_packages_whole(installed: Installed) -> None:
+def test_the_wheel_holds_the_packages_whole(installed: Installed):
     names = set(zipfile.ZipFile(installed.wheel).namelist())
     for package in SHIPPED:
         files = {
@@ -124,7 +124,7 @@ def test_the_wheel_holds_the_packages_whole(installed: Installed) -> None:
         assert "/".join(parts) in names
 
 
-def test_an_index_takes_both(installed: Installed) -> None:
+def test_an_index_takes_both(installed: Installed):
     assert not twine.commands.check.check([str(installed.sdist), str(installed.wheel)], strict=True)
     with tarfile.open(installed.sdist) as archive:
         names = {Path(*Path(name).parts[1:]).as_posix() for name in archive.getnames()}
@@ -137,22 +137,20 @@ def test_an_index_takes_both(installed: Installed) -> None:
     } <= names
 
 
-def test_the_programs_are_those_of_the_wheel(installed: Installed, tmp_path: Path) -> None:
+def test_the_programs_are_those_of_the_wheel(installed: Installed, tmp_path: Path):
     where = installed.run(
         tmp_path, "python", "-c", "import erfsfm, slam; print(erfsfm.__file__, slam.__file__)"
     )
     assert all(Path(file).is_relative_to(installed.environment) for file in where.split())
 
 
-def test_it_runs(
-    installed: Installed, tmp_path: Path, check_run: Callable[[Path], dict[str, Any]]
-) -> None:
+def test_it_runs(installed: Installed, tmp_path: Path, check_run: Callable[[Path], dict[str, Any]]):
     installed.run(tmp_path, "erfsfm-slam", "run", "--frames", "0:40")
     metrics = check_run(tmp_path / "results" / "latest")
     assert metrics["sequence"]["frames"] == 40 and metrics["map"]["triangles"] > 1000
 
 
-def test_it_trains_by_name(installed: Installed, tmp_path: Path) -> None:
+def test_it_trains_by_name(installed: Installed, tmp_path: Path):
     assert {
         row["name"] for row in json.loads(installed.run(tmp_path, "erfsfm", "networks", "--json"))
     } >= {"depthnet"}

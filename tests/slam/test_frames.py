@@ -8,7 +8,7 @@ import numpy as np
 from slam.frames import Frame, Intrinsics, RelativePose
 
 
-def test_rays_project_back_to_their_pixels() -> None:
+def test_rays_project_back_to_their_pixels():
     camera = Intrinsics(40, 30, 50.0, 55.0, 19.5, 14.0)
     grid = camera.pixel_grid()
     rays = camera.rays(grid)
@@ -21,13 +21,13 @@ def image(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 255, (30, 40, 3), np.uint8)
 
 
-def test_grey_levels_are_made_once_a_frame() -> None:
+def test_grey_levels_are_made_once_a_frame():
     frame = Frame(3, 0.3, image())
     np.testing.assert_array_equal(frame.grey, cv2.cvtColor(image(), cv2.COLOR_RGB2GRAY))
     assert frame.grey is frame.grey
 
 
-def test_what_is_derived_from_a_frame_is_kept_by_its_key() -> None:
+def test_what_is_derived_from_a_frame_is_kept_by_its_key():
     frame = Frame(0, 0.0, image())
     made: list[str] = []
 
@@ -47,7 +47,7 @@ def test_what_is_derived_from_a_frame_is_kept_by_its_key() -> None:
     )
 
 
-def test_a_relative_pose_in_another_unit_has_other_lengths_only() -> None:
+def test_a_relative_pose_in_another_unit_has_other_lengths_only():
     T = np.eye(4)
     T[:3, 3] = [1.0, 2.0, 3.0]
     measured = RelativePose(3, 4, T, np.arange(1.0, 7.0), "network", np.arange(2.0, 8.0), 4.0)

@@ -79,7 +79,7 @@ def cells(table: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
 
-def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(job: Any) -> None:
+def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(job: Any):
     results = results_of(job, {"default": [1.0, 3.0]})
     results.append(runs.JobResult(replace(job, seed=2), Metrics(), "out of memory"))
     text = page.error_tables(results)
@@ -92,9 +92,7 @@ def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(job: Any)
 @pytest.mark.parametrize(
     ("moved_m", "turned_deg", "false"), [(1.9, 4.9, 0), (2.1, 0.0, 1), (0.0, 5.1, 1)]
 )
-def test_true_and_false_loops(
-    tmp_path: Path, moved_m: float, turned_deg: float, false: int
-) -> None:
+def test_true_and_false_loops(tmp_path: Path, moved_m: float, turned_deg: float, false: int):
     T_world_camera = np.tile(np.eye(4), (3, 1, 1))
     T_world_camera[:, :3, 3] = [[0, 0, 0], [4, 0, 0], [4, 0, 7]]
     T_world_camera[2, :3, :3] = Rotation.from_euler("y", 90, degrees=True).as_matrix()
@@ -119,7 +117,7 @@ def test_true_and_false_loops(
 
 
 @pytest.mark.slow
-def test_two_checkouts_in_turn(tmp_path: Path) -> None:
+def test_two_checkouts_in_turn(tmp_path: Path):
     report, here = tmp_path / "page.md", Path(__file__).parents[2]
     words = f"speed --against {here} --frames 12 --pairs 1 --output {tmp_path / 'out'}"
     benchmark.main([*words.split(), "--report", str(report)])
@@ -134,7 +132,7 @@ def test_two_checkouts_in_turn(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_one_real_run_and_one_that_fails(tmp_path: Path) -> None:
+def test_one_real_run_and_one_that_fails(tmp_path: Path):
     report = tmp_path / "page.md"
     words = "accuracy --routes straight --worlds 610 --frames 8 --seeds 0 --weights sim nonesuch"
     words += f" --set mapping.enabled=false --output {tmp_path / 'out'} --report {report}"

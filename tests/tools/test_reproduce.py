@@ -24,7 +24,7 @@ def tool(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     return runpy.run_path(str(TOOLS / "reproduce.py"))
 
 
-def test_rows_are_those_of_the_paper(tool: dict[str, Any]) -> None:
+def test_rows_are_those_of_the_paper(tool: dict[str, Any]):
     rows = tool["paper_rows"](["*"])
     assert len(rows) == 36 and len({row.training for row in rows}) == 15
     first = tool["paper_rows"](["table1-posenet-416x128"])
@@ -41,7 +41,7 @@ def test_tables_of_a_small_fake(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:
+):
     kitti = write_root(tmp_path / "kitti", frames=12, sequences=("00", "06", "09", "10"))
     raw, split = write_drive(tmp_path / "raw"), tmp_path / "frames.txt"
     split.write_text("2011_09_26_drive_0099 4\n")
@@ -68,7 +68,7 @@ def test_tables_of_a_small_fake(
 
 def test_what_is_tested_is_required_first(
     tool: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     kitti = write_root(tmp_path / "kitti", frames=12, sequences=("00", "06", "09"))
     monkeypatch.setattr(sys, "argv", ["reproduce.py"])
     with pytest.raises(SystemExit, match="no sequence 10"):

@@ -9,7 +9,7 @@ import pytest
 TOOLS = Path(__file__).parents[2] / "tools"
 
 
-def test_the_page_of_settings_is_current(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_page_of_settings_is_current(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.syspath_prepend(str(TOOLS))
     monkeypatch.setattr(
         sys, "argv", ["settings_page.py", "--output", str(tmp_path / "settings.md")]

@@ -31,7 +31,7 @@ def outcome(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
     return run
 
 
-def test_a_warning_that_repeats_is_said_once() -> None:
+def test_a_warning_that_repeats_is_said_once():
     program = "import logging\nfrom erfsfm.common import command_line\n"
     program += "def app(args, prog_name):\n for k in range(111): logging.getLogger('images').warning('image %d', k)\n"
     program += " raise OSError('the error')\ncommand_line.run(app, 'program', logging.WARNING)"
@@ -41,7 +41,7 @@ def test_a_warning_that_repeats_is_said_once() -> None:
     assert said.splitlines() == ["WARNING images: image 0", "program: the error"]
 
 
-def test_a_terminal_in_ascii_shows_what_it_can() -> None:
+def test_a_terminal_in_ascii_shows_what_it_can():
     program = (
         "from erfsfm.common.command_line import run\n"
         "run(lambda args, prog_name: print('drive \u2014 m\u00fcde'), 'program', 30)"
@@ -76,7 +76,7 @@ def raising(error: Exception) -> Callable[[object], object]:
         ),
     ],
 )
-def test_every_error_is_one_line(outcome: Outcome, error: Exception, line: str) -> None:
+def test_every_error_is_one_line(outcome: Outcome, error: Exception, line: str):
     code, err = outcome(raising(error))
     assert code == 1 and err.startswith(line) and len(err.splitlines()) == 1
 
@@ -89,7 +89,7 @@ def test_how_much_is_said_on_the_terminal(
     capsys: pytest.CaptureFixture[str],
     option: str | None,
     said: str,
-) -> None:
+):
     app = command_line.application("program", "It speaks.")
 
     @app.command()

@@ -52,7 +52,7 @@ def refusal(file: Path | None, *overrides: str) -> str:
     return str(caught.value)
 
 
-def test_files_and_overrides(tmp_path: Path) -> None:
+def test_files_and_overrides(tmp_path: Path):
     path = tmp_path / "a.yaml"
     path.write_text("flow: {method: dense, window_px: 7}")
     assert load(path, "flow.window_px=9", "flow.window_px=13", "gaps={enabled: false}") == Settings(
@@ -63,7 +63,7 @@ def test_files_and_overrides(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text", ["flow.side=3", "flow={side: 3}", "bridging.enabled=false", "bridging={}", "bridging="]
 )
-def test_an_unknown_key_is_one_line(tmp_path: Path, text: str) -> None:
+def test_an_unknown_key_is_one_line(tmp_path: Path, text: str):
     key = "flow.side" if text.startswith("flow") else "bridging"
     assert re.search(
         rf"unknown key '{key}.*' in --set {re.escape(text)}; (known keys|did you mean)",
@@ -74,7 +74,7 @@ def test_an_unknown_key_is_one_line(tmp_path: Path, text: str) -> None:
     assert f"unknown key 'flow.side' in {path}" in refusal(path)
 
 
-def test_an_error_names_its_origin(tmp_path: Path) -> None:
+def test_an_error_names_its_origin(tmp_path: Path):
     path = tmp_path / "a.yaml"
     path.write_text("flow: {window_px: x}")
     assert "a.yaml should be a valid integer" in refusal(path)
@@ -89,7 +89,7 @@ def test_an_error_names_its_origin(tmp_path: Path) -> None:
     )  # of which the override itself is most
 
 
-def test_both_dumps_read_back() -> None:
+def test_both_dumps_read_back():
     settings = load(None, "flow.window_px=5")
     for text in (dump_yaml(settings), dump_explained(settings)):
         assert Settings.model_validate(parse_yaml(text)) == settings
@@ -107,19 +107,19 @@ def test_both_dumps_read_back() -> None:
         "a: b: c",
     ],
 )
-def test_refused_yaml_is_one_line(text: str) -> None:
+def test_refused_yaml_is_one_line(text: str):
     with pytest.raises(YamlError) as caught:
         parse_yaml(text)
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 300
 
 
-def test_numbers_and_lists_are_read() -> None:
+def test_numbers_and_lists_are_read():
     assert parse_yaml("1e-4") == 1e-4
     assert parse_yaml("[1E5, -2e+3, .5e1, 1.0]") == [1e5, -2e3, 5.0, 1.0]
     assert parse_yaml("") is None
 
 
-def test_files(tmp_path: Path) -> None:
+def test_files(tmp_path: Path):
     path = tmp_path / "a.yaml"
     path.write_text("\ufeffname: Zürich\n", encoding="utf-8")
     assert read_yaml(path) == {"name": "Zürich"}

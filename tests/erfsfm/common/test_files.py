@@ -21,7 +21,7 @@ from erfsfm.common.files import (
 )
 
 
-def test_a_pipe_or_a_device_keeps_its_place(tmp_path: Path) -> None:
+def test_a_pipe_or_a_device_keeps_its_place(tmp_path: Path):
     """A superuser's rename would put a file there, also in the place of /dev/null."""
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
@@ -30,7 +30,7 @@ def test_a_pipe_or_a_device_keeps_its_place(tmp_path: Path) -> None:
     assert pipe.is_fifo() and list(tmp_path.iterdir()) == [pipe]
 
 
-def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
+def test_a_file_that_is_too_large_is_not_read(tmp_path: Path):
     with (tmp_path / "sparse").open("wb") as file:
         file.truncate(2**40)
     with pytest.raises(OSError, match="larger than 1024 MiB"):
@@ -38,9 +38,7 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", FIGURE_SUFFIXES)
-def test_a_figure_replaces_a_figure_and_equal_ones_are_equal_files(
-    tmp_path: Path, suffix: str
-) -> None:
+def test_a_figure_replaces_a_figure_and_equal_ones_are_equal_files(tmp_path: Path, suffix: str):
     path, contents = tmp_path / f"figure{suffix}", []
     for _ in range(2):
         save_figure(Figure(), path, dpi=50)
@@ -50,7 +48,7 @@ def test_a_figure_replaces_a_figure_and_equal_ones_are_equal_files(
     )  # its ids are random without the style of our plots
 
 
-def test_another_image_stays(tmp_path: Path) -> None:
+def test_another_image_stays(tmp_path: Path):
     image = tmp_path / "000000.png"
     cv2.imwrite(str(image), np.zeros((4, 4, 3), np.uint8))
     before = image.read_bytes()
@@ -62,7 +60,7 @@ def test_another_image_stays(tmp_path: Path) -> None:
     assert image.read_bytes() == before
 
 
-def test_a_folder_is_held_until_the_end_of_the_block(tmp_path: Path) -> None:
+def test_a_folder_is_held_until_the_end_of_the_block(tmp_path: Path):
     with FolderLock() as lock:
         lock.take(tmp_path / "run")
         with (
@@ -75,7 +73,7 @@ def test_a_folder_is_held_until_the_end_of_the_block(tmp_path: Path) -> None:
     assert not list((tmp_path / "run").iterdir())
 
 
-def test_who_waits_holds_a_folder_after_the_other(tmp_path: Path) -> None:
+def test_who_waits_holds_a_folder_after_the_other(tmp_path: Path):
     events = []
 
     def wait() -> None:

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_info
 from erfsfm.common.processes import limit_library_threads, read_ahead
 
 
-def test_thread_counts_are_limited_and_restored_also_after_an_error() -> None:
+def test_thread_counts_are_limited_and_restored_also_after_an_error():
     blas = [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
     before = cv2.getNumThreads()
     cv2.setNumThreads(3)
@@ -33,7 +33,7 @@ def test_thread_counts_are_limited_and_restored_also_after_an_error() -> None:
         cv2.setNumThreads(before)
 
 
-def test_one_process_of_many_starts_no_threads() -> None:
+def test_one_process_of_many_starts_no_threads():
     program = (
         "import cv2, numpy\n"
         "from threadpoolctl import threadpool_info\n"
@@ -51,7 +51,7 @@ def test_one_process_of_many_starts_no_threads() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_one_is_read_while_another_is_used() -> None:
+def test_one_is_read_while_another_is_used():
     begun: list[int] = []
     second = Event()
 
@@ -67,7 +67,7 @@ def test_one_is_read_while_another_is_used() -> None:
     assert list(numbers) == [50, 60, 70] and begun == [4, 5, 6, 7]
 
 
-def test_two_threads_read_at_once_and_in_order() -> None:
+def test_two_threads_read_at_once_and_in_order():
     both = Barrier(2)
 
     def read(number: int) -> int:

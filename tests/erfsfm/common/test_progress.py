@@ -12,7 +12,7 @@ import pytest
 from erfsfm.common.progress import duration, progress_bar, progress_lines
 
 
-def test_lines_say_what_is_done_and_the_time_left() -> None:
+def test_lines_say_what_is_done_and_the_time_left():
     lines: list[str] = []
     with progress_lines(lines.append, every_s=0.1) as progress:
         for stage, done in (("frames, 1", 1), ("frames, 2", 2), ("loops", 0)):
@@ -26,18 +26,18 @@ def test_lines_say_what_is_done_and_the_time_left() -> None:
 @pytest.mark.parametrize(
     ("seconds", "words"), [(68, "1 min 8 s"), (9000, "2 h 30 min"), (432_000, "5.0 days")]
 )
-def test_long_times_are_said_in_hours_and_days(seconds: int, words: str) -> None:
+def test_long_times_are_said_in_hours_and_days(seconds: int, words: str):
     assert duration(seconds) == words
 
 
-def test_short_work_is_quiet_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+def test_short_work_is_quiet_without_a_terminal(capsys: pytest.CaptureFixture[str]):
     with progress_bar() as progress:
         progress("frames", 1, 2)
         progress("frames", 2, 2)
     assert capsys.readouterr() == ("", "")
 
 
-def test_a_terminal_has_a_bar_for_each_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_terminal_has_a_bar_for_each_stage(monkeypatch: pytest.MonkeyPatch):
     class Terminal(io.StringIO):
         def isatty(self) -> bool:
             return True

@@ -11,7 +11,7 @@ from erfsfm.common.signals import Terminated, raising_on_termination
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
-def test_a_signal_raises_with_its_name_and_code_until_it_is_ignored(name: str) -> None:
+def test_a_signal_raises_with_its_name_and_code_until_it_is_ignored(name: str):
     number = getattr(signal, name)
     with (
         pytest.raises(Terminated, match=f"ended by {name}") as raised,
@@ -28,7 +28,7 @@ def test_a_signal_raises_with_its_name_and_code_until_it_is_ignored(name: str) -
     assert signal.getsignal(number) is signal.SIG_DFL
 
 
-def test_a_signal_that_is_ignored_or_handled_stays_so() -> None:
+def test_a_signal_that_is_ignored_or_handled_stays_so():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
     try:
         with raising_on_termination():

@@ -12,14 +12,14 @@ from erfsfm.common.table import Table, csv_of, table_of
 TABLE = Table(["name", "length\nm"], [["a [b] <c>", "1.50"], ["d", "–"]], "one & two", ["a note"])
 
 
-def test_on_a_terminal_nothing_is_marked_up_or_cut(capsys: pytest.CaptureFixture[str]) -> None:
+def test_on_a_terminal_nothing_is_marked_up_or_cut(capsys: pytest.CaptureFixture[str]):
     TABLE.print()
     lines = [line.strip() for line in capsys.readouterr().out.splitlines() if line.strip()]
     assert lines[0] == "one & two" and lines[-1] == "a note"
     assert [line.split() for line in lines[-3:-1]] == [["a", "[b]", "<c>", "1.50"], ["d", "–"]]
 
 
-def test_markdown_sets_numbers_to_the_right() -> None:
+def test_markdown_sets_numbers_to_the_right():
     assert TABLE.markdown().splitlines() == [
         "| name | length m |",
         "|---|---:|",
@@ -28,7 +28,7 @@ def test_markdown_sets_numbers_to_the_right() -> None:
     ]
 
 
-def test_html_is_escaped() -> None:
+def test_html_is_escaped():
     text = TABLE.html()
     assert (
         "<h3>one &amp; two</h3>" in text
@@ -37,7 +37,7 @@ def test_html_is_escaped() -> None:
     )
 
 
-def test_records_become_a_table_and_csv() -> None:
+def test_records_become_a_table_and_csv():
     records = [{"name": "a", "value": 0.12345, "other": None}, {"name": "b, c", "more": 3}]
     table = table_of(records)
     assert table.names == 1 and table.rows[0] == ["a", "0.1235", "–", "–"]

@@ -35,9 +35,7 @@ def centre_of(image: NDArray[np.uint8]) -> NDArray[np.float64]:
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("flip", [0.0, 1.0])
 @pytest.mark.parametrize("zoom", [1.0, 1.15, 1.3])
-def test_points_project_to_where_the_augmented_image_has_them(
-    seed: int, flip: float, zoom: float
-) -> None:
+def test_points_project_to_where_the_augmented_image_has_them(seed: int, flip: float, zoom: float):
     images = [blob(project(CAMERA, point)) for point in POINTS]
     config = DataConfig(flip=flip, zoom=zoom)
     varied, _, camera, _ = augment(
@@ -52,7 +50,7 @@ def test_points_project_to_where_the_augmented_image_has_them(
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_maps_move_with_the_images(seed: int) -> None:
+def test_maps_move_with_the_images(seed: int):
     image = blob(project(CAMERA, POINTS[0]))
     values = image[..., 0].astype(np.float32)
     config = DataConfig(flip=0.5, zoom=1.3)
@@ -65,7 +63,7 @@ def test_maps_move_with_the_images(seed: int) -> None:
     np.testing.assert_allclose(centre, centre_of(varied), atol=0.25)
 
 
-def test_a_rolled_camera_sees_points_where_it_should_at_the_same_depth() -> None:
+def test_a_rolled_camera_sees_points_where_it_should_at_the_same_depth():
     angle = np.deg2rad(3)
     turn = np.array(
         [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
@@ -79,7 +77,7 @@ def test_a_rolled_camera_sees_points_where_it_should_at_the_same_depth() -> None
         )
 
 
-def test_the_papers_flip_is_one_pixel_off() -> None:
+def test_the_papers_flip_is_one_pixel_off():
     images = [blob(project(CAMERA, POINTS[0]))]
     varied, _, camera, _ = augment(
         images, [], CAMERA, DataConfig(flip=1, zoom=1), "paper", np.random.default_rng(0)
@@ -90,7 +88,7 @@ def test_the_papers_flip_is_one_pixel_off() -> None:
 
 
 @pytest.mark.parametrize(("fidelity", "rounded"), [("default", True), ("paper", False)])
-def test_the_papers_zoom_multiplies_the_camera_before_sizes_are_rounded(fidelity, rounded) -> None:
+def test_the_papers_zoom_multiplies_the_camera_before_sizes_are_rounded(fidelity, rounded):
     images, config = [np.zeros((96, 160, 3), np.uint8)], DataConfig(flip=0, zoom=1.15)
     _, _, camera, _ = augment(images, [], CAMERA, config, fidelity, np.random.default_rng(7))
     sizes = np.array([160 * camera.fx / CAMERA.fx, 96 * camera.fy / CAMERA.fy])
@@ -98,7 +96,7 @@ def test_the_papers_zoom_multiplies_the_camera_before_sizes_are_rounded(fidelity
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_all_frames_get_the_same_colour_change(seed: int) -> None:
+def test_all_frames_get_the_same_colour_change(seed: int):
     rng = np.random.default_rng(9)
     image = rng.integers(0, 256, (96, 160, 3), dtype=np.uint8)
     config = DataConfig(flip=0, zoom=1, colour_jitter=0.3)
@@ -118,13 +116,13 @@ def images() -> list[NDArray[np.uint8]]:
     return [np.repeat(np.rint(60 + 150 * spot).astype(np.uint8)[..., None], 3, axis=2)] * 5
 
 
-def test_only_the_seed_decides(images: list[NDArray[np.uint8]]) -> None:
+def test_only_the_seed_decides(images: list[NDArray[np.uint8]]):
     first, again, other = (weathered(images, np.random.default_rng(seed)) for seed in (3, 3, 4))
     assert all(np.array_equal(a, b) for a, b in zip(first, again))
     assert any(not np.array_equal(a, b) for a, b in zip(first, other))
 
 
-def test_images_stay_images_and_many_get_worse(images: list[NDArray[np.uint8]]) -> None:
+def test_images_stay_images_and_many_get_worse(images: list[NDArray[np.uint8]]):
     changes = []
     for seed in range(40):
         seen = weathered(images, np.random.default_rng(seed))
@@ -135,7 +133,7 @@ def test_images_stay_images_and_many_get_worse(images: list[NDArray[np.uint8]]) 
     assert max(changes) < 100
 
 
-def test_positions_do_not_change(images: list[NDArray[np.uint8]]) -> None:
+def test_positions_do_not_change(images: list[NDArray[np.uint8]]):
     """The mean over much weather has its brightest place where the clear image has it."""
     seen = [
         image.astype(float)[..., 0]

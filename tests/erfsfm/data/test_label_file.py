@@ -15,7 +15,7 @@ def measured(sigma: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("sigma", [0.01, 0.037, 0.13, 0.5])
-def test_values_move_by_less_than_their_sigma(sigma: float) -> None:
+def test_values_move_by_less_than_their_sigma(sigma: float):
     least, most = measured(sigma)
     got_least, got_most = (bound.astype(np.float32) for bound in decode(encode(least, most)))
     moved = np.log(got_least * got_most / (least * most)) / 2
@@ -24,7 +24,7 @@ def test_values_move_by_less_than_their_sigma(sigma: float) -> None:
     assert (width > 0.65).all() and (width < 1.5).all()
 
 
-def test_what_is_unknown_stays_unknown() -> None:
+def test_what_is_unknown_stays_unknown():
     least, most = measured(0.03)
     least[:8], most[:8] = 0, 1 / 60  # the sky
     most[20:30, :32] = np.inf  # something in front of the road
@@ -37,7 +37,7 @@ def test_what_is_unknown_stays_unknown() -> None:
     np.testing.assert_allclose(got_least[20:30, :32].astype(float), least[20:30, :32], rtol=0.02)
 
 
-def test_labels_in_half_precision_become_small_and_other_files_are_refused() -> None:
+def test_labels_in_half_precision_become_small_and_other_files_are_refused():
     least, most = (bound.astype(np.float16) for bound in measured(0.03))
     assert len(encode(least, most)) < least.nbytes / 4
     for data in (b"", b"no picture"):

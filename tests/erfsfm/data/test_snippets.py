@@ -62,9 +62,7 @@ def coded(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("fidelity", "cx"), [("default", 24 * 2 / 3 - 0.5), ("paper", 23.5 * 2 / 3)]
 )
-def test_samples_have_the_intrinsics_of_their_fidelity(
-    coded: Path, fidelity: str, cx: float
-) -> None:
+def test_samples_have_the_intrinsics_of_their_fidelity(coded: Path, fidelity: str, cx: float):
     """Images of 48 pixels at a width of 32."""
     config = experiment(flip=0, zoom=1)
     network = config.network.model_copy(update={"width": 32, "fidelity": fidelity})
@@ -79,7 +77,7 @@ def test_samples_have_the_intrinsics_of_their_fidelity(
 
 def test_snippets_with_a_broken_image_are_passed_over_and_others_stay(
     coded: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     def drawn() -> list[dict[str, Tensor]]:
         recordings = discover(coded / "a") + discover(coded / "b")
         draws = SnippetDraws(recordings, experiment(flip=0), 40)
@@ -115,9 +113,7 @@ def equal(first: dict[str, Tensor], second: dict[str, Tensor]) -> bool:
 
 
 @pytest.mark.parametrize("sources", [2, 4])
-def test_windows_are_consecutive_frames_with_the_target_in_the_middle(
-    coded: Path, sources: int
-) -> None:
+def test_windows_are_consecutive_frames_with_the_target_in_the_middle(coded: Path, sources: int):
     draws = SnippetDraws(discover(coded), experiment(sources=sources), 200)
     starts = set()
     for number in range(200):
@@ -140,7 +136,7 @@ def batches(coded: Path, workers: int, first: int = 0, draws: int = 10) -> list[
     )
 
 
-def test_weather_changes_only_the_network_input(coded: Path) -> None:
+def test_weather_changes_only_the_network_input(coded: Path):
     clear = SnippetDraws(discover(coded), experiment(), 20)
     wet = SnippetDraws(discover(coded), experiment(weather=0.5), 20)
     changed = 0
@@ -156,7 +152,7 @@ def test_weather_changes_only_the_network_input(coded: Path) -> None:
     assert 3 <= changed <= 16
 
 
-def test_what_a_mask_hides_comes_with_every_sample(coded: Path) -> None:
+def test_what_a_mask_hides_comes_with_every_sample(coded: Path):
     mask = np.full((32, 48), 255, np.uint8)
     mask[24:] = 0
     cv2.imwrite(str(coded / "a" / "mask.png"), mask)
@@ -172,12 +168,12 @@ def test_what_a_mask_hides_comes_with_every_sample(coded: Path) -> None:
         assert not sample["fixed"][0, :23].any()
 
 
-def test_a_camera_that_has_to_be_found_is_found_by_a_run(coded: Path) -> None:
+def test_a_camera_that_has_to_be_found_is_found_by_a_run(coded: Path):
     with pytest.raises(DataError, match="erfsfm-slam run"):
         split_recordings(experiment(roots=[str(coded)]).data, Path("auto"))
 
 
-def test_resuming_draws_the_same_samples(coded: Path) -> None:
+def test_resuming_draws_the_same_samples(coded: Path):
     whole = batches(coded, 0)
     for workers in (0, 2):
         tail = batches(coded, workers, first=6)
@@ -186,7 +182,7 @@ def test_resuming_draws_the_same_samples(coded: Path) -> None:
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_devices_share_the_draws_of_one_with_a_larger_batch(coded: Path, workers: int) -> None:
+def test_devices_share_the_draws_of_one_with_a_larger_batch(coded: Path, workers: int):
     whole = list(DataLoader(SnippetDraws(discover(coded), experiment(batch=4), 16, 4), 4))
     config = experiment(batch=2, devices=2)
     parts = [
@@ -198,7 +194,7 @@ def test_devices_share_the_draws_of_one_with_a_larger_batch(coded: Path, workers
         assert equal(batch, {key: torch.cat([part[key] for part in batches]) for key in batch})
 
 
-def test_weights_set_the_probabilities(coded: Path) -> None:
+def test_weights_set_the_probabilities(coded: Path):
     long, short = discover(coded)
     config = experiment(weights={"folder/a": 1, "folder/b": 3})
     draws = SnippetDraws([long, short.part(0, 4)], config, 400)
@@ -209,9 +205,7 @@ def test_weights_set_the_probabilities(coded: Path) -> None:
 # validation
 
 
-def test_validation_is_even_and_always_the_same(
-    coded: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_validation_is_even_and_always_the_same(coded: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("erfsfm.data.snippets._VALIDATED", 3)
     config = experiment()
     snippets = ValidationSnippets(discover(coded)[:1], config)
@@ -224,7 +218,7 @@ def test_validation_is_even_and_always_the_same(
     assert set(snippets[0]) == {"target", "sources", "K"}
 
 
-def test_validation_truth(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+def test_validation_truth(tmp_path: Path, write_root: Callable[..., Path]):
     write_root(tmp_path, frames=5, depth=True, step=(0.05, 0.0, 0.1))
     (recording,) = discover(tmp_path)
     sample = ValidationSnippets([recording.part(0, 5)], experiment(sources=4))[0]
@@ -237,7 +231,7 @@ def test_validation_truth(tmp_path: Path, write_root: Callable[..., Path]) -> No
     torch.testing.assert_close(T_source_target[:, 2, 3], 0.1 * steps)
 
 
-def test_exact_labels_of_a_snippet_and_its_mirror_image(tmp_path: Path) -> None:
+def test_exact_labels_of_a_snippet_and_its_mirror_image(tmp_path: Path):
     """True motion and depth in camera heights, of a camera of the reference focal length."""
     street = SimulatedStreet(SimulationOptions("straight", 6, 1, 96, 64))
     write_kitti_root(street, tmp_path, depth=True)
@@ -277,7 +271,7 @@ def test_exact_labels_of_a_snippet_and_its_mirror_image(tmp_path: Path) -> None:
 
 def test_exact_labels_are_wanted_of_every_recording(
     tmp_path: Path, write_root: Callable[..., Path]
-) -> None:
+):
     config = experiment(sources=2).model_copy(update={"teacher": TeacherConfig(structure_weight=1)})
     with pytest.raises(DataError, match=r"kitti_odometry/00 has none: simulate with --depth"):
         SnippetDraws(discover(write_root(tmp_path, 6)), config, draws=4)
@@ -338,7 +332,7 @@ def mixed(
 
 def test_the_label_is_the_inverse_depth_in_camera_heights(
     world: Path, mixed: Callable[..., ExperimentConfig], measure: Callable[..., None]
-) -> None:
+):
     config = mixed()
     measure(config, lambda *_: 0.25)
     recordings, _ = split_recordings(config.data)
@@ -365,7 +359,7 @@ def test_the_label_is_the_inverse_depth_in_camera_heights(
 
 def test_a_batch_begins_with_its_share_of_single_images(
     mixed: Callable[..., ExperimentConfig], measure: Callable[..., None]
-) -> None:
+):
     config = mixed()
     measure(config, lambda *_: 0.25)
     recordings, _ = split_recordings(config.data)
@@ -380,7 +374,7 @@ def test_a_batch_begins_with_its_share_of_single_images(
 
 def test_a_prepared_folder_trains_without_the_worlds(
     mixed: Callable[..., ExperimentConfig], measure: Callable[..., None], tmp_path: Path
-) -> None:
+):
     config = mixed()
     measure(config, lambda *_: 0.25)
     prepare(config, tmp_path / "prepared")
@@ -406,7 +400,7 @@ def test_a_depth_camera_is_exact_and_what_it_does_not_see_may_be_anywhere(
     tmp_path: Path,
     caplog: pytest.LogCaptureFixture,
     where: str,
-) -> None:
+):
     folder = tmp_path / "office"
     (folder / "depth").mkdir(parents=True)
     (folder / "images").mkdir()
@@ -438,9 +432,7 @@ def test_a_depth_camera_is_exact_and_what_it_does_not_see_may_be_anywhere(
     assert "000003.png" in caplog.text
 
 
-def test_worlds_are_drawn_by_their_weight(
-    world: Path, mixed: Callable[..., ExperimentConfig]
-) -> None:
+def test_worlds_are_drawn_by_their_weight(world: Path, mixed: Callable[..., ExperimentConfig]):
     (recording,) = discover(world)
     twice = [recording, replace(recording, name="folder/office")]
     np.testing.assert_allclose(chances(twice, [1, 1], {"simulated": 9, "folder": 1}), [0.9, 0.1])
@@ -465,7 +457,7 @@ def imitation(root: Path) -> ExperimentConfig:
 
 def test_the_label_is_what_the_network_gives_for_the_larger_image(
     write_root: Callable[..., Path], tmp_path: Path
-) -> None:
+):
     config = imitation(write_root(tmp_path / "real", 3))
     (recording,), _ = split_recordings(config.data)
     seen = []
@@ -486,7 +478,7 @@ def test_the_label_is_what_the_network_gives_for_the_larger_image(
     assert len(seen) == 1, "the label is kept"
 
 
-def test_it_trains_depth_alone(write_root: Callable[..., Path], tmp_path: Path) -> None:
+def test_it_trains_depth_alone(write_root: Callable[..., Path], tmp_path: Path):
     output = train(imitation(write_root(tmp_path / "real", 5)), tmp_path / "run", device="cpu")
     assert (output / "last" / "depth.safetensors").is_file()
     assert not (output / "last" / "pose.safetensors").exists()

@@ -25,7 +25,7 @@ class Painted:
 
 
 @pytest.mark.parametrize("limit_mb, decoded", [(10, [0, 1]), (0, [0, 1, 0, 1])])
-def test_decodes_once_while_there_is_room(limit_mb: int, decoded: list[int]) -> None:
+def test_decodes_once_while_there_is_room(limit_mb: int, decoded: list[int]):
     recording, cache = Painted(), ArrayCache(limit_mb, (HEIGHT, WIDTH, 3), np.uint8)
     for index in (0, 1, 0, 1):
         (image,) = load_window(cache, Snippet(recording, index), 1)  # type: ignore[arg-type]
@@ -33,7 +33,7 @@ def test_decodes_once_while_there_is_room(limit_mb: int, decoded: list[int]) -> 
     assert recording.decoded == decoded
 
 
-def test_a_returned_array_is_the_callers_when_its_place_is_used_again() -> None:
+def test_a_returned_array_is_the_callers_when_its_place_is_used_again():
     cache = ArrayCache(1, (HEIGHT, WIDTH, 3), np.float16)  # room for one
     held = cache.get("a", lambda: np.full((HEIGHT, WIDTH, 3), np.inf, np.float16))
     cache.get("b", lambda: np.zeros((HEIGHT, WIDTH, 3), np.float16))[:] = 9

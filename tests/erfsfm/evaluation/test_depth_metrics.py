@@ -16,7 +16,7 @@ from erfsfm.evaluation.depth_metrics import (
 )
 
 
-def test_perfect_up_to_scale() -> None:
+def test_perfect_up_to_scale():
     truth = np.random.default_rng(0).uniform(1, 70, (6, 8)).astype(np.float32)
     errors = depth_errors(truth / 7, truth)
     assert errors.scale == pytest.approx(7, rel=1e-6)
@@ -25,7 +25,7 @@ def test_perfect_up_to_scale() -> None:
     assert errors.a1 == errors.a2 == errors.a3 == 1
 
 
-def test_by_hand_without_scaling() -> None:
+def test_by_hand_without_scaling():
     truth = np.array([[10.0, 20.0, 0.0]], np.float32)
     guess = np.array([[12.0, 10.0, 5.0]], np.float32)
     errors = depth_errors(guess, truth, scaling=1.0)
@@ -37,7 +37,7 @@ def test_by_hand_without_scaling() -> None:
     assert (errors.a1, errors.a2, errors.a3) == (0.5, 0.5, 0.5)
 
 
-def test_scaled_predictions_are_clipped_afterwards() -> None:
+def test_scaled_predictions_are_clipped_afterwards():
     truth = np.array([[10.0, 10.0, 79.0]], np.float32)
     guess = np.array([[1.0, 1.0, 1000.0]], np.float32)
     errors = depth_errors(guess, truth)
@@ -45,7 +45,7 @@ def test_scaled_predictions_are_clipped_afterwards() -> None:
     assert errors.rmse == pytest.approx(math.sqrt(1 / 3)), "80 against 79, not 10000"
 
 
-def test_valid_pixels() -> None:
+def test_valid_pixels():
     truth = np.full((100, 200), 5.0, np.float32)
     truth[50, 50:53] = [0, 80, 90]
     assert (~valid_pixels(truth, 80, "none")).sum() == 3
@@ -53,7 +53,7 @@ def test_valid_pixels() -> None:
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (153, 370, 44, 1196)
 
 
-def test_every_image_counts_once() -> None:
+def test_every_image_counts_once():
     truth = np.full((1, 4), 10, np.float32)
     first = depth_errors(truth, truth, scaling=1.0)
     second = depth_errors(truth * 1.5, truth, scaling=1.0)
@@ -62,7 +62,7 @@ def test_every_image_counts_once() -> None:
     assert mean_errors([first, second]).abs_rel == pytest.approx(0.25)
 
 
-def test_standard_error_and_ratio_are_those_over_streets() -> None:
+def test_standard_error_and_ratio_are_those_over_streets():
     assert standard_error([1.0, 3.0]) == pytest.approx(1.0), (
         "a standard deviation of sqrt(2) of two streets"
     )

@@ -51,7 +51,7 @@ class Slanted(Flat):
         return super().depth(image) * np.linspace(1, 2, image.shape[1], dtype=np.float32)
 
 
-def test_depth(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+def test_depth(tmp_path: Path, write_root: Callable[..., Path]):
     write_root(tmp_path, frames=11, depth=True, seed=600, step=STEP)
     networks, median = depth_protocol({"networks": Flat()}, [tmp_path], allow_leak=False)
     assert networks["images"] == 3, "every fifth frame"
@@ -61,7 +61,7 @@ def test_depth(tmp_path: Path, write_root: Callable[..., Path]) -> None:
     assert median["method"] == "median depth map"
 
 
-def test_refined_depth_of_pairs_with_masks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refined_depth_of_pairs_with_masks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A run of each street against all of the truth, what stands and what moves; too short a street is left out."""
     for folder in ("images", "truth", "moving", "calib"):
         (tmp_path / folder).mkdir()
@@ -102,7 +102,7 @@ def test_refined_depth_of_pairs_with_masks(tmp_path: Path, monkeypatch: pytest.M
 
 def test_depth_of_a_pack(
     tmp_path: Path, write_root: Callable[..., Path], small: dict[str, dict[str, object]]
-) -> None:
+):
     """It holds smaller images than depth maps, and depth of the middle of each snippet alone."""
     roots = [write_root(tmp_path / "seen", frames=3, seed=1)]
     roots += [write_root(tmp_path / "held_out", frames=11, depth=True, seed=500, step=STEP)]
@@ -128,7 +128,7 @@ def write_pairs(root: Path, street: str, farther: list[bool]) -> None:
         cv2.imwrite(str(root / "truth" / f"{street}_{index:06d}.png"), truth)
 
 
-def test_streets_count_alike_and_have_standard_errors(tmp_path: Path) -> None:
+def test_streets_count_alike_and_have_standard_errors(tmp_path: Path):
     write_pairs(tmp_path / "pairs", "06", [True] * 5 + [False] * 5)
     write_pairs(tmp_path / "pairs", "08", [False] * 20)
     rows = depth_protocol({"networks": Flat()}, [tmp_path / "pairs"], allow_leak=False)
@@ -142,7 +142,7 @@ def test_streets_count_alike_and_have_standard_errors(tmp_path: Path) -> None:
     assert mean["a1"] == pytest.approx((1 - 0.25 / 2 + 1) / 2)
 
 
-def test_a_picture_of_each_street_shows_image_depths_and_truth(tmp_path: Path) -> None:
+def test_a_picture_of_each_street_shows_image_depths_and_truth(tmp_path: Path):
     write_pairs(tmp_path / "pairs", "06", [True, False])
     networks = {"a": Flat(), "b": Slanted()}
     depth_protocol(networks, [tmp_path / "pairs"], allow_leak=False, pictures=tmp_path / "pictures")
@@ -154,7 +154,7 @@ def test_a_picture_of_each_street_shows_image_depths_and_truth(tmp_path: Path) -
     assert truth[40, 40] > truth[50, 50] + 100 > truth[20, 20] + 200, "unknown is dark"
 
 
-def test_networks_are_compared_street_by_street(tmp_path: Path) -> None:
+def test_networks_are_compared_street_by_street(tmp_path: Path):
     write_pairs(tmp_path / "pairs", "06", [True] * 4)
     write_pairs(tmp_path / "pairs", "08", [True, False])
     mean, other, *single = depth_protocol(
@@ -177,7 +177,7 @@ def test_networks_are_compared_street_by_street(tmp_path: Path) -> None:
 
 def test_drives_with_lidar_and_worlds_are_streets(
     tmp_path: Path, write_drive: Callable[..., Path], write_root: Callable[..., Path]
-) -> None:
+):
     roots = [
         write_drive(tmp_path / "raw"),
         write_root(tmp_path / "world", frames=11, depth=True, seed=600),
@@ -193,7 +193,7 @@ def test_drives_with_lidar_and_worlds_are_streets(
     assert rows[0]["abs_rel_se"] == pytest.approx(0, abs=1e-3)
 
 
-def test_a_leak_of_one_street_is_refused(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+def test_a_leak_of_one_street_is_refused(tmp_path: Path, write_root: Callable[..., Path]):
     write_pairs(tmp_path / "pairs", "06", [True])
     roots = [tmp_path / "pairs", write_root(tmp_path / "kitti", frames=2, depth=True)]
     with pytest.raises(DataError, match=r"leak: .* kitti_odometry/00\[0:2\]"):

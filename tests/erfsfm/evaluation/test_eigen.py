@@ -58,7 +58,7 @@ def split(tmp_path: Path) -> str:
 
 
 @pytest.mark.parametrize("fidelity", ["default", "paper"])
-def test_both_scales(tmp_path: Path, write_drive: Write, split: str, fidelity: str) -> None:
+def test_both_scales(tmp_path: Path, write_drive: Write, split: str, fidelity: str):
     root = write_drive(tmp_path / "raw")
     oracle = Oracle()
     median, pose, flat = eigen_protocol(oracle, root, split, fidelity, allow_leak=False)
@@ -73,14 +73,14 @@ def test_both_scales(tmp_path: Path, write_drive: Write, split: str, fidelity: s
 
 def test_a_wrong_unit_of_motion_affects_the_pose_row_alone(
     tmp_path: Path, write_drive: Write, split: str
-) -> None:
+):
     root = write_drive(tmp_path / "raw", speed=12.0)
     median, pose, _ = eigen_protocol(Oracle(), root, split, "default", allow_leak=False)
     assert median["abs_rel"] == pytest.approx(0, abs=1e-5)
     assert pose["abs_rel"] == pytest.approx(0.2, abs=1e-5)
 
 
-def test_clipping_is_what_fidelity_changes(tmp_path: Path, write_drive: Write, split: str) -> None:
+def test_clipping_is_what_fidelity_changes(tmp_path: Path, write_drive: Write, split: str):
     """200 units are clipped to 80 before scaling (paper), or 20 m after it (default)."""
     root = write_drive(tmp_path / "raw")
     far = Oracle(unit=0.1)
@@ -92,7 +92,7 @@ def test_clipping_is_what_fidelity_changes(tmp_path: Path, write_drive: Write, s
     )
 
 
-def test_a_car_that_stands_still(tmp_path: Path, write_drive: Write, split: str) -> None:
+def test_a_car_that_stands_still(tmp_path: Path, write_drive: Write, split: str):
     root = write_drive(tmp_path / "raw", speed=0.0)
     median, pose, _ = eigen_protocol(Oracle(), root, split, "default", allow_leak=False)
     assert (median["images"], pose["images"], pose["abs_rel"]) == (3, 0, None)
@@ -103,7 +103,7 @@ def test_a_car_that_stands_still(tmp_path: Path, write_drive: Write, split: str)
     assert pose["scale_spread"] is None
 
 
-def test_leaks_are_refused_by_frame(tmp_path: Path, write_drive: Write, split: str) -> None:
+def test_leaks_are_refused_by_frame(tmp_path: Path, write_drive: Write, split: str):
     root = write_drive(tmp_path / "raw")
     seen = Oracle(seen=[f"kitti_raw/{DRIVE}[4:5]"])
     with pytest.raises(DataError, match=rf"leak: .*{DRIVE}\[4:5\]"):
@@ -114,7 +114,7 @@ def test_leaks_are_refused_by_frame(tmp_path: Path, write_drive: Write, split: s
     )
 
 
-def test_the_eigen_list(tmp_path: Path) -> None:
+def test_the_eigen_list(tmp_path: Path):
     """697 frames of 28 drives; of the four that are odometry sequences, one frame lies beyond its sequence's end."""
     frames = read_split("eigen", tmp_path)
     assert len(frames) == len(set(frames)) == 697
@@ -129,7 +129,7 @@ def test_the_eigen_list(tmp_path: Path) -> None:
 
 
 @pytest.mark.data
-def test_shipped_weights_on_a_real_drive(data_root: Path, tmp_path: Path) -> None:
+def test_shipped_weights_on_a_real_drive(data_root: Path, tmp_path: Path):
     """Never seen in training: better than the baseline, and both fidelities agree where clipping does not matter."""
     (tmp_path / "split.txt").write_text(
         "".join(f"2011_09_26_drive_0013 {i}\n" for i in (5, 25, 45))
@@ -150,7 +150,7 @@ PointsAt = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float
 @pytest.mark.parametrize("fidelity", ["default", "paper"])
 def test_pixels_count_from_one_and_the_nearest_wins(
     tmp_path: Path, write_drive: Write, points_at: PointsAt, fidelity: str
-) -> None:
+):
     places = np.array([[10.0, 20.0], [10.4, 19.6], [96.0, 64.0], [97.0, 5.0], [0.4, 5.0]])
     points = points_at(places, np.array([30.0, 12.0, 50.0, 7.0, 7.0]))
     behind = np.array([[-5, 0, 0, 1]], np.float32)
@@ -164,7 +164,7 @@ def test_pixels_count_from_one_and_the_nearest_wins(
 
 def test_the_papers_numbering_confuses_the_ends_of_rows(
     tmp_path: Path, write_drive: Write, points_at: PointsAt
-) -> None:
+):
     """The last pixel of row 9 and the first of row 10 share a number; the one met first gets the nearest depth."""
     points = points_at(np.array([[96.0, 10.0], [1.0, 11.0]]), np.array([40.0, 15.0]))
     frame = RawFrame(write_drive(tmp_path, points=points), DRIVE, 0)
@@ -173,7 +173,7 @@ def test_the_papers_numbering_confuses_the_ends_of_rows(
     assert (paper[9, 95], paper[10, 0]) == pytest.approx((15, 15))
 
 
-def test_displacements_are_trapezoids(tmp_path: Path, write_drive: Write) -> None:
+def test_displacements_are_trapezoids(tmp_path: Path, write_drive: Write):
     root = write_drive(tmp_path, speed=0.0)
     oxts = root / "2011_09_26" / f"{DRIVE}_sync/oxts/data"
     values = np.zeros(30)
@@ -185,7 +185,7 @@ def test_displacements_are_trapezoids(tmp_path: Path, write_drive: Write) -> Non
 
 
 @pytest.mark.data
-def test_a_real_scan(data_root: Path) -> None:
+def test_a_real_scan(data_root: Path):
     """Fidelities differ at ends of rows alone; at the stored size depth is the same scene's."""
     root, drive = data_root / "kitti_raw", "2011_09_26_drive_0013"
     frame = RawFrame(root, drive, 7)
@@ -199,7 +199,7 @@ def test_a_real_scan(data_root: Path) -> None:
 
 
 @pytest.mark.data
-def test_a_real_drive_moves_as_its_gps_does(data_root: Path) -> None:
+def test_a_real_drive_moves_as_its_gps_does(data_root: Path):
     frame = RawFrame(data_root / "kitti_raw", "2011_09_26_drive_0013", 60)
     places = []
     for index in (58, 60):

@@ -34,7 +34,7 @@ def random_poses(rng: np.random.Generator, count: int) -> Poses:
     return T
 
 
-def test_a_scaled_copy_is_perfect() -> None:
+def test_a_scaled_copy_is_perfect():
     true = snippets_from_trajectory(random_poses(np.random.default_rng(1), 12))
     predicted = true.copy()
     predicted[..., :3, 3] *= np.linspace(0.1, 7.0, len(true))[:, None, None]
@@ -44,14 +44,14 @@ def test_a_scaled_copy_is_perfect() -> None:
     assert errors.count == 8
 
 
-def test_hand_value_of_ate_is_norm_over_five_after_its_own_scale() -> None:
+def test_hand_value_of_ate_is_norm_over_five_after_its_own_scale():
     # g = (0 1 2 3 4), p = (0 1 1 1 1): s = 10 / 4, residuals -1.5 -0.5 0.5 1.5, norm sqrt(5)
     errors = snippet_errors(straight([0, 1, 1, 1, 1])[None], straight([0, 1, 2, 3, 4])[None])
     assert errors.ate_mean == pytest.approx(math.sqrt(5) / 5, rel=1e-14)
     assert errors.ate_std == 0.0
 
 
-def test_hand_value_of_re_counts_the_first_frame() -> None:
+def test_hand_value_of_re_counts_the_first_frame():
     true, predicted = straight([0, 1, 2, 3, 4])[None], straight([0, 1, 2, 3, 4])[None]
     for k in range(1, 5):
         predicted[0, k, :3, :3] = Rotation.from_rotvec([0.0, 0.1 * k, 0.0]).as_matrix()
@@ -59,7 +59,7 @@ def test_hand_value_of_re_counts_the_first_frame() -> None:
     assert errors.re_mean == pytest.approx(1.0 / 5, rel=1e-12)
 
 
-def test_paper_fidelity_averages_over_four_zero_rows() -> None:
+def test_paper_fidelity_averages_over_four_zero_rows():
     rng = np.random.default_rng(2)
     true, predicted = (
         snippets_from_trajectory(random_poses(rng, 30)),
@@ -76,7 +76,7 @@ def test_paper_fidelity_averages_over_four_zero_rows() -> None:
     assert paper.count == plain.count == 26
 
 
-def test_no_predicted_motion_is_scored_as_standing_still() -> None:
+def test_no_predicted_motion_is_scored_as_standing_still():
     errors = snippet_errors(straight([0] * 5)[None], straight([0, 3, 0, 4, 0])[None])
     assert errors == SnippetErrors(1.0, 0.0, 0.0, 0.0, 1)
     rounding = snippet_errors(
@@ -85,7 +85,7 @@ def test_no_predicted_motion_is_scored_as_standing_still() -> None:
     assert rounding == errors
 
 
-def test_snippets_start_at_the_identity_and_hold_relative_poses() -> None:
+def test_snippets_start_at_the_identity_and_hold_relative_poses():
     T_world_camera = random_poses(np.random.default_rng(3), 9)
     snippets = snippets_from_trajectory(T_world_camera)
     assert snippets.shape == (5, 5, 4, 4)
@@ -96,7 +96,7 @@ def test_snippets_start_at_the_identity_and_hold_relative_poses() -> None:
     assert snippets_from_trajectory(T_world_camera[:4]).shape == (0, 5, 4, 4)
 
 
-def test_network_output_becomes_the_snippet_of_the_trajectory() -> None:
+def test_network_output_becomes_the_snippet_of_the_trajectory():
     T_world_camera = random_poses(np.random.default_rng(4), 5)
     T_camera_world = np.linalg.inv(T_world_camera)
     T_source_target = (T_camera_world @ T_world_camera[2])[[0, 1, 3, 4]]
@@ -123,7 +123,7 @@ def test_scores_of_public_trajectories(
     stereo: tuple[float, ...],
     ahead: tuple[float, ...],
     mean_motion: tuple[float, ...],
-) -> None:
+):
     """DF-VO's stereo-trained trajectories, and the two constant motions that every network must beat."""
     golden = data_root / "golden"
     T_world_camera = read_trajectory(golden / f"reference_{sequence}.txt").T_world_camera

@@ -54,7 +54,7 @@ class Oracle:
 
 
 @pytest.mark.parametrize("name", ["00", "kitti_odometry/00"])
-def test_pose(tmp_path: Path, write_root: Callable[..., Path], name: str) -> None:
+def test_pose(tmp_path: Path, write_root: Callable[..., Path], name: str):
     write_root(tmp_path, frames=9, step=STEP, cameras=("image_2", "image_3"))
     networks, straight = pose_protocol(Oracle(STEP), tmp_path, [name], "default", allow_leak=False)
     assert networks["snippets"] == 5
@@ -65,7 +65,7 @@ def test_pose(tmp_path: Path, write_root: Callable[..., Path], name: str) -> Non
 
 def test_the_pose_network_alone_stands_beside_what_is_measured(
     tmp_path: Path, write_root: Callable[..., Path]
-) -> None:
+):
     write_root(tmp_path, frames=9, step=STEP)
 
     class Measuring(Oracle):
@@ -86,7 +86,7 @@ def test_the_pose_network_alone_stands_beside_what_is_measured(
 
 def test_frames_of_a_sequence_are_checked_for_leaks(
     tmp_path: Path, write_root: Callable[..., Path]
-) -> None:
+):
     write_root(tmp_path, frames=20, step=STEP)
     seen = Oracle(STEP, seen=["kitti_odometry/00[0:12]"])
     networks, _ = pose_protocol(seen, tmp_path, ["00[12:]"], "default", allow_leak=False)
@@ -96,9 +96,7 @@ def test_frames_of_a_sequence_are_checked_for_leaks(
         pose_protocol(seen, tmp_path, ["00[11:]"], "default", allow_leak=False)
 
 
-def test_paper_fidelity_counts_four_empty_snippets(
-    tmp_path: Path, write_root: Callable[..., Path]
-) -> None:
+def test_paper_fidelity_counts_four_empty_snippets(tmp_path: Path, write_root: Callable[..., Path]):
     write_root(tmp_path, frames=9, step=STEP)
     default = pose_protocol(Oracle(STEP), tmp_path, ["00"], "default", allow_leak=False)[1]
     paper = pose_protocol(Oracle(STEP), tmp_path, ["00"], "paper", allow_leak=False)[1]

@@ -22,7 +22,7 @@ from slam.simulation.options import SimulationOptions
 from slam.simulation.street import SimulatedStreet
 
 
-def test_bounds_are_narrow_in_camera_heights_and_hold_the_truth() -> None:
+def test_bounds_are_narrow_in_camera_heights_and_hold_the_truth():
     (least, most), true = label(*seen(FRAME, NEIGHBOURS)), truth(FRAME)
     error, known = errors((least, most), true)
     assert known > 0.4 and np.median(error) < 0.03

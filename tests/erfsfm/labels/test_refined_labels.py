@@ -12,7 +12,7 @@ from erfsfm.labels.refined_labels import in_camera_heights, refined_label, shrun
 NEAR = (-1, 1, 3)
 
 
-def test_more_is_known_than_by_flow_alone_and_it_is_as_right() -> None:
+def test_more_is_known_than_by_flow_alone_and_it_is_as_right():
     network = 7 * cv2.GaussianBlur(truth(FRAME), (0, 0), 4) ** np.float32(0.9) + np.float32(
         0.05
     )  # in its own unit
@@ -29,7 +29,7 @@ def test_more_is_known_than_by_flow_alone_and_it_is_as_right() -> None:
     assert between.mean() > 0.8
 
 
-def test_the_unit_of_learned_depth_may_be_off_in_a_frame() -> None:
+def test_the_unit_of_learned_depth_may_be_off_in_a_frame():
     exact, middles = np.maximum(truth(FRAME), np.float32(0.008)), []
     for unit in (0.8, 1.0, 1.25):
         error, known = errors(
@@ -40,7 +40,7 @@ def test_the_unit_of_learned_depth_may_be_off_in_a_frame() -> None:
     assert max(middles) < 0.02
 
 
-def test_no_scale_where_flow_measures_nothing() -> None:
+def test_no_scale_where_flow_measures_nothing():
     blank = np.full((64, 128), 120, np.uint8)
     _, _, K, T_neighbour_target = seen(FRAME, (-1, 1))
     measured = measure(blank, [blank] * 2, K, T_neighbour_target)

@@ -29,7 +29,7 @@ def slowly(costs: np.ndarray, grey: np.ndarray) -> np.ndarray:
     return total
 
 
-def test_paths_equal_those_of_an_obvious_loop() -> None:
+def test_paths_equal_those_of_an_obvious_loop():
     rng = np.random.default_rng(0)
     costs = rng.random((5, 6, 7)).astype(np.float32)
     grey = rng.uniform(0, 40, (6, 7)).astype(np.float32)

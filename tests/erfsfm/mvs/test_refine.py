@@ -70,14 +70,14 @@ def refined(images: list[np.ndarray], prior: np.ndarray, unit: float = 1.0) -> R
     return DECIDE(measured(images, prior, unit))
 
 
-def test_a_post_of_six_pixels_is_measured() -> None:
+def test_a_post_of_six_pixels_is_measured():
     views = [wall_and_step(p, left=-3.0, right=-2.76) for p in [(0.0, 0.0, 0.0), *POSITIONS]]
     found = measured([image for image, _ in views], np.full((H, W), 9.0))
     post = (found.depth * np.exp(-found.change))[views[0][1] < 7]
     assert (np.abs(post - 6) < 0.6).mean() > 0.9
 
 
-def test_a_wall_and_a_step_are_found_from_a_wrong_guess() -> None:
+def test_a_wall_and_a_step_are_found_from_a_wrong_guess():
     images = [wall_and_step(position)[0] for position in [(0.0, 0.0, 0.0), *POSITIONS]]
     truth = wall_and_step((0.0, 0.0, 0.0))[1]
     found = refined(images, np.full((H, W), 9.0))
@@ -88,7 +88,7 @@ def test_a_wall_and_a_step_are_found_from_a_wrong_guess() -> None:
     assert np.median(step) <= 2.5, "the step lies where the image has it"
 
 
-def test_sigma_is_honest() -> None:
+def test_sigma_is_honest():
     images = [wall_and_step(position)[0] for position in [(0.0, 0.0, 0.0), *POSITIONS]]
     noise = np.random.default_rng(0)
     noisy = [
@@ -102,7 +102,7 @@ def test_sigma_is_honest() -> None:
     assert (z < 2).mean() > 0.85
 
 
-def test_without_texture_the_guess_stays_and_says_so() -> None:
+def test_without_texture_the_guess_stays_and_says_so():
     blank = [np.full((H, W), 120, np.uint8)] * (len(POSITIONS) + 1)
     prior = np.full((H, W), 9.0)
     found = refined(blank, prior)
@@ -111,7 +111,7 @@ def test_without_texture_the_guess_stays_and_says_so() -> None:
     assert found.relative_sigma.min() >= 0.1
 
 
-def test_what_no_neighbour_shows_is_not_measured() -> None:
+def test_what_no_neighbour_shows_is_not_measured():
     """As behind a fence, or under a leaf on the lens: the sigma is that of a guess."""
     images = [wall_and_step((0.0, 0.0, 0.0)), *(wall_and_step(position) for position in POSITIONS)]
     image, depth = images[0]
@@ -122,7 +122,7 @@ def test_what_no_neighbour_shows_is_not_measured() -> None:
     assert result.measured[hidden].mean() < 0.05 < 0.5 < result.measured[~hidden].mean()
 
 
-def test_sky_moves_away_from_a_near_guess() -> None:
+def test_sky_moves_away_from_a_near_guess():
     images = [road_and_car(p, k)[0] for k, p in enumerate([(0.0, 0.0, 0.0), *POSITIONS])]
     _, truth, car = road_and_car((0.0, 0.0, 0.0), 0)
     sky = (Y < -0.08) & ~car
@@ -131,7 +131,7 @@ def test_sky_moves_away_from_a_near_guess() -> None:
 
 
 @pytest.mark.parametrize("guess", [8.0, 9.0])
-def test_a_car_that_drives_ahead_keeps_the_guess(guess: float) -> None:
+def test_a_car_that_drives_ahead_keeps_the_guess(guess: float):
     images = [road_and_car(p, k)[0] for k, p in enumerate([(0.0, 0.0, 0.0), *POSITIONS])]
     _, truth, car = road_and_car((0.0, 0.0, 0.0), 0)
     prior = np.where(car, guess, np.minimum(truth, 60.0))
@@ -140,7 +140,7 @@ def test_a_car_that_drives_ahead_keeps_the_guess(guess: float) -> None:
     np.testing.assert_allclose(np.median(found.depth[lower]), guess, rtol=0.05)
 
 
-def test_the_unit_of_length_does_not_matter() -> None:
+def test_the_unit_of_length_does_not_matter():
     images = [wall_and_step(position)[0] for position in [(0.0, 0.0, 0.0), *POSITIONS]]
     metres, feet = (refined(images, np.full((H, W), 9.0), unit=unit) for unit in (1.0, 1 / 0.3048))
     np.testing.assert_allclose(np.median(feet.depth * 0.3048 / metres.depth), 1, atol=1e-4)

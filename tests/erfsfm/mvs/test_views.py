@@ -15,7 +15,7 @@ def a_motion() -> np.ndarray:
     return T
 
 
-def test_a_point_lands_where_the_camera_sees_it() -> None:
+def test_a_point_lands_where_the_camera_sees_it():
     T = a_motion()
     u, v, _ = Projection(K, T, 20, 30).pixels(np.full((20, 30), 1 / 4, np.float32))
     point = T[:3, :3] @ (4 * np.linalg.inv(K) @ [21.0, 7.0, 1.0]) + T[:3, 3]
@@ -23,7 +23,7 @@ def test_a_point_lands_where_the_camera_sees_it() -> None:
     np.testing.assert_allclose([u[7, 21], v[7, 21]], expected, atol=1e-4)
 
 
-def test_derivatives_are_those_of_small_differences() -> None:
+def test_derivatives_are_those_of_small_differences():
     projection = Projection(K, a_motion(), 20, 30)
     inverse = np.full((20, 30), 0.2, np.float32)
     u, v, z = projection.pixels(inverse)

@@ -53,7 +53,7 @@ SLOW = ("erf-depthnet-dilated", "erf-depthnet-dfcv2", "erf-posenet-dfc", "erf-po
 @torch.inference_mode()
 def test_a_graph_has_the_outputs_of_its_network_on_other_images_too(
     name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     monkeypatch.setattr(deformable, "_LARGE", 2**40)  # all in plain PyTorch
     kind = "depth" if "depth" in name else "pose"
     network = with_moving_taps(build(name, width=0.125, sources=4))
@@ -68,9 +68,7 @@ def test_a_graph_has_the_outputs_of_its_network_on_other_images_too(
 
 
 @torch.inference_mode()
-def test_networks_with_large_deformable_layers_are_not_exported(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_networks_with_large_deformable_layers_are_not_exported(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(deformable, "_LARGE", 1)
     network = with_moving_taps(build("erf-depthnet-dfc", width=0.25))
     graph, calls = OnnxGraph(lambda: network, 1, "a network"), calls_of(network)
@@ -109,7 +107,7 @@ def kept_graph(made_from: str, made: bytes) -> bytes:
     return made if graph is None else graph
 
 
-def test_the_graph_of_a_network_is_read_again_and_no_other(tmp_path: Path) -> None:
+def test_the_graph_of_a_network_is_read_again_and_no_other(tmp_path: Path):
     assert output(2.0, "two") == 2.0
     assert folder() == tmp_path / "erfsfm" and len(list(folder().iterdir())) == 1
     assert output(3.0, "two") == 2.0, "the graph was made again"
@@ -119,7 +117,7 @@ def test_the_graph_of_a_network_is_read_again_and_no_other(tmp_path: Path) -> No
     )
 
 
-def test_a_damaged_graph_is_made_again() -> None:
+def test_a_damaged_graph_is_made_again():
     assert kept_graph("one", b"graph") == b"graph"
     (file,) = folder().iterdir()
     for content in (b"", file.read_bytes()[:-1], file.read_bytes().replace(b"graph", b"graff")):
@@ -131,7 +129,7 @@ def test_a_damaged_graph_is_made_again() -> None:
 @pytest.mark.parametrize("changed", ["networks/blocks.py", "geometry.py"])
 def test_a_graph_of_older_code_is_made_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changed: str
-) -> None:
+):
     package = shutil.copytree(
         Path(onnx_graph.__file__).parents[1], tmp_path / "code", ignore=NO_CODE
     )

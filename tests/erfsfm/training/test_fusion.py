@@ -20,7 +20,7 @@ from erfsfm.training.fusion import FusionNet, fusion_loss
 Cli = Callable[..., tuple[int, str, str]]
 
 
-def test_the_loss_is_least_at_the_truth_and_where_the_sigma_is_the_error() -> None:
+def test_the_loss_is_least_at_the_truth_and_where_the_sigma_is_the_error():
     wanted = torch.linspace(-0.5, 0.5, 96).reshape(1, 8, 12)
     known = torch.ones_like(wanted, dtype=torch.bool)
     sigma = torch.full_like(wanted, -2.0)
@@ -43,7 +43,7 @@ def test_the_loss_is_least_at_the_truth_and_where_the_sigma_is_the_error() -> No
 @pytest.mark.slow
 def test_a_network_is_trained_on_worlds_and_refines_a_run(
     tmp_path: Path, command_line: Cli, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     """On a processor that does not compute with bfloat16, training does not either."""
     forward, in_bfloat16 = FusionNet.forward, set()
 
@@ -106,7 +106,7 @@ def test_a_network_is_trained_on_worlds_and_refines_a_run(
     )
 
 
-def test_a_network_begins_with_the_shipped_one() -> None:
+def test_a_network_begins_with_the_shipped_one():
     evidence = torch.randn(1, CHANNELS, 16, 24, generator=torch.Generator().manual_seed(0))
     net = FusionNet(CHANNELS, 4 * CHANGE)
     path = DepthFusion("default").path
@@ -116,7 +116,7 @@ def test_a_network_begins_with_the_shipped_one() -> None:
         np.testing.assert_allclose(found.detach().numpy(), expected, atol=1e-4)
 
 
-def test_a_fresh_network_trusts_the_measurement_at_every_pixel() -> None:
+def test_a_fresh_network_trusts_the_measurement_at_every_pixel():
     evidence = torch.zeros(1, CHANNELS, 16, 24)
     block = evidence[:, 4 * CHANGE : 4 * CHANGE + 4]
     block[:] = torch.rand(block.shape)

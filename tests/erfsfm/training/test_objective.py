@@ -86,7 +86,7 @@ def evaluate(
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.85])
 def test_the_true_depth_and_motion_have_the_least_loss(
     batch: SnippetBatch, plane, reduction: str, ssim_weight: float
-) -> None:
+):
     config = experiment(reduction=reduction, ssim_weight=ssim_weight)
     truth = float(evaluate(batch, config, 1 / plane.distance, true_poses(), 2).total)
     assert 0 <= truth < 0.02
@@ -103,9 +103,7 @@ def test_the_true_depth_and_motion_have_the_least_loss(
         assert float(outcome.total) > 2 * truth, name
 
 
-def test_networks_get_the_weather_and_the_error_is_of_the_clear_images(
-    batch: SnippetBatch, plane
-) -> None:
+def test_networks_get_the_weather_and_the_error_is_of_the_clear_images(batch: SnippetBatch, plane):
     seen: list[Tensor] = []
 
     class Watching(FixedDepth):
@@ -129,7 +127,7 @@ def test_networks_get_the_weather_and_the_error_is_of_the_clear_images(
 
 
 @pytest.mark.parametrize("reduction", ["mean", "minimum"])
-def test_gradient_points_towards_truth(batch: SnippetBatch, plane, reduction: str) -> None:
+def test_gradient_points_towards_truth(batch: SnippetBatch, plane, reduction: str):
     for factor in (0.9, 1.1):
         depth_net = FixedDepth(factor / plane.distance)
         pose_net = FixedPose(factor * true_poses())
@@ -181,7 +179,7 @@ def naive_photometric(batch: SnippetBatch, disparities: list[Tensor], vectors: n
     return total
 
 
-def test_mean_is_the_papers_formula() -> None:
+def test_mean_is_the_papers_formula():
     generator = torch.Generator().manual_seed(5)
     disparities = [
         torch.rand(2, 1, 32 >> s, 40 >> s, generator=generator).double() * 0.2 + 0.1
@@ -210,7 +208,7 @@ def test_mean_is_the_papers_formula() -> None:
     )
 
 
-def test_a_row_of_the_paper_weighs_its_terms_as_the_reference_does() -> None:
+def test_a_row_of_the_paper_weighs_its_terms_as_the_reference_does():
     """Grey 0.3 beside 0.5 is 0.4 apart in [-1, 1]: 0.4 of each source and scale, and 0.2 of the smoothness."""
 
     class Parabola(nn.Module):
@@ -231,7 +229,7 @@ def test_a_row_of_the_paper_weighs_its_terms_as_the_reference_does() -> None:
     assert float(outcome.total) == pytest.approx(0.4 * 4 * 4 + 0.2 * smoothness)
 
 
-def test_minimum_tolerates_an_occluded_source(batch: SnippetBatch, plane) -> None:
+def test_minimum_tolerates_an_occluded_source(batch: SnippetBatch, plane):
     sources = batch.sources.clone()
     sources[:, 0, :, 20:40, 30:60] = 0
     hidden = SnippetBatch(batch.target, sources, batch.K)
@@ -242,7 +240,7 @@ def test_minimum_tolerates_an_occluded_source(batch: SnippetBatch, plane) -> Non
         assert (covered < 1.5 * clear) is forgives
 
 
-def test_no_visible_points_no_loss(batch: SnippetBatch) -> None:
+def test_no_visible_points_no_loss(batch: SnippetBatch):
     """All points behind both sources: no error, and gradients that are numbers."""
     vectors = torch.tensor([[0, 0, -100.0, 0, 0, 0]] * 2).double()
     for reduction in ("minimum", "mean"):
@@ -255,7 +253,7 @@ def test_no_visible_points_no_loss(batch: SnippetBatch) -> None:
         assert torch.isfinite(pose_net.vectors.grad).all()
 
 
-def test_the_mask_keeps_what_moves(batch: SnippetBatch, plane) -> None:
+def test_the_mask_keeps_what_moves(batch: SnippetBatch, plane):
     """A passenger's view: the left half travels with the camera, the right half passes by."""
     sources = batch.sources.clone()
     sources[..., :48] = batch.target[:, None, :, :, :48]
@@ -275,7 +273,7 @@ def test_the_mask_keeps_what_moves(batch: SnippetBatch, plane) -> None:
 
 
 @pytest.mark.parametrize("reduction", ["mean", "minimum"])
-def test_what_is_fixed_to_the_camera_has_no_error(batch: SnippetBatch, reduction: str) -> None:
+def test_what_is_fixed_to_the_camera_has_no_error(batch: SnippetBatch, reduction: str):
     """The lower half is hidden by something that no motion explains."""
     half = batch.target.shape[2] // 2
     fixed = torch.zeros_like(batch.target[:, :1], dtype=torch.bool)
@@ -292,7 +290,7 @@ def test_what_is_fixed_to_the_camera_has_no_error(batch: SnippetBatch, reduction
     assert float(known.terms["photometric"]) == pytest.approx(float(other.terms["photometric"]))
 
 
-def test_autocast_does_not_reach_the_geometry(plane, batch: SnippetBatch) -> None:
+def test_autocast_does_not_reach_the_geometry(plane, batch: SnippetBatch):
     single = SnippetBatch(batch.target.float(), batch.sources.float(), batch.K.float())
     config = experiment(ssim_weight=0.85)
     depth_net, pose_net = FixedDepth(1 / plane.distance).float(), FixedPose(true_poses().float())
@@ -321,9 +319,7 @@ def _taught(views: str = "many", networks: str = "both", **loss: Any) -> Experim
 
 
 @pytest.mark.parametrize("views", ["exact", "many"])
-def test_labels_have_one_unit_that_depth_and_motion_must_have(
-    batch: SnippetBatch, views: str
-) -> None:
+def test_labels_have_one_unit_that_depth_and_motion_must_have(batch: SnippetBatch, views: str):
     vectors = torch.tensor(
         [[0.3, 0.0, -0.1, 0.0, 0.1, 0.0], [-0.3, 0.0, 0.1, 0.0, -0.1, 0.0]]
     ).double()
@@ -346,7 +342,7 @@ def test_labels_have_one_unit_that_depth_and_motion_must_have(
     )  # the unit is not the depth's
 
 
-def test_many_views_warp_the_images_by_the_measured_motion(batch: SnippetBatch, plane) -> None:
+def test_many_views_warp_the_images_by_the_measured_motion(batch: SnippetBatch, plane):
     in_heights = true_poses() * torch.tensor([10.0] * 3 + [1] * 3)
     T_source_target = pose_vector_to_matrix(in_heights)[None].expand(2, 2, 4, 4)
     shape = (2, 1, *batch.target.shape[-2:])

@@ -42,7 +42,7 @@ def silent(stage: str, done: int, total: int) -> None:
     """No progress bar."""
 
 
-def test_a_manifest_names_drives(tmp_path: Path) -> None:
+def test_a_manifest_names_drives(tmp_path: Path):
     manifest = tmp_path / "a.csv"
     manifest.write_text(
         "dataset, sequence, camera, options\nkitti,09,,--frames 0:90\nwalk.mp4,,c.yaml,\nother/walk.mp4,,,\n"
@@ -63,7 +63,7 @@ def test_a_manifest_names_drives(tmp_path: Path) -> None:
         ("dataset,name\na,x\nb,x", "two drives are named x"),
     ],
 )
-def test_a_manifest_that_is_not_understood(tmp_path: Path, text: str, said: str) -> None:
+def test_a_manifest_that_is_not_understood(tmp_path: Path, text: str, said: str):
     path = tmp_path / "drives.csv"
     path.write_text(text)
     with pytest.raises(SequenceError, match=said):
@@ -80,7 +80,7 @@ def test_a_manifest_that_is_not_understood(tmp_path: Path, text: str, said: str)
 )
 def test_wrong_options_of_all_drives_are_refused_before_anything_is_written(
     tmp_path: Path, command_line: CommandLine, words: str, said: str
-) -> None:
+):
     manifest, output = tmp_path / "drives.csv", tmp_path / "out"
     manifest.write_text("dataset\na\nb\n")
     code, _, err = command_line(
@@ -89,7 +89,7 @@ def test_wrong_options_of_all_drives_are_refused_before_anything_is_written(
     assert code == 1 and said in err and err.count("\n") == 1 and not output.exists()
 
 
-def test_sequences_of_a_data_set(kitti_root: Path) -> None:
+def test_sequences_of_a_data_set(kitti_root: Path):
     (drive,) = drives_of(kitti_root, ["all"], [])
     assert drive.name == "sim" and drive.arguments[:2] == ("--dataset", str(kitti_root.absolute()))
     with pytest.raises(SequenceError, match="has no sequence 12: it has sim"):
@@ -100,7 +100,7 @@ def test_sequences_of_a_data_set(kitti_root: Path) -> None:
 
 def test_a_later_batch_adds_its_drives_to_those_of_earlier_ones(
     tmp_path: Path, make_run: Callable[..., RunFolder], monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     """A drive that is named again has the row of the later batch; rows of runs say how far to trust them."""
     whole = make_run()
 
@@ -123,7 +123,7 @@ def test_a_later_batch_adds_its_drives_to_those_of_earlier_ones(
 @pytest.mark.slow
 def test_failures_are_told_apart_and_whole_runs_are_kept(
     kitti_root: Path, tiny_weights: Path, tmp_path: Path
-) -> None:
+):
     manifest, output = tmp_path / "drives.csv", tmp_path / "out"
     manifest.write_text(f"name,dataset\ngood,{kitti_root}\nbad,nowhere\n")
     words = [*QUICK, "--weights", str(tiny_weights), "--frames", "0:6"]
@@ -144,7 +144,7 @@ def test_failures_are_told_apart_and_whole_runs_are_kept(
 
 def test_a_drive_that_needs_too_much_memory_is_ended(
     kitti_root: Path, tiny_weights: Path, tmp_path: Path
-) -> None:
+):
     """What an earlier run left, which was ended before its map, is no whole run."""
     (sim,) = drives_of(
         kitti_root, ["all"], [*QUICK, "--weights", str(tiny_weights), "--frames", "0:6"]
@@ -165,7 +165,7 @@ def test_paths_of_the_command_line_are_seen_from_where_it_is_given(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     command_line: CommandLine,
-) -> None:
+):
     here, data = tmp_path / "here", tmp_path / "data"
     shutil.copytree(tiny_weights, here / "mine")
     shutil.copytree(kitti_root, data / "root")
@@ -187,9 +187,7 @@ def test_paths_of_the_command_line_are_seen_from_where_it_is_given(
 
 
 @pytest.mark.parametrize("name", ["drives.csv", "sim.log"])
-def test_files_of_somebody_else_are_not_replaced(
-    tmp_path: Path, kitti_root: Path, name: str
-) -> None:
+def test_files_of_somebody_else_are_not_replaced(tmp_path: Path, kitti_root: Path, name: str):
     drives = drives_of(kitti_root, ["all"], [])
     check_output(tmp_path, drives)
     with pytest.raises(RunError, match=r"a drive is named drives\.csv"):
@@ -213,7 +211,7 @@ def dies_once(drive: Drive) -> Outcome:
 
 
 @pytest.mark.slow
-def test_the_drive_of_a_killed_worker_is_run_again(tmp_path: Path) -> None:
+def test_the_drive_of_a_killed_worker_is_run_again(tmp_path: Path):
     pytest.importorskip("dask.distributed")
     drives = [Drive(str(n), tmp_path, ()) for n in range(4)]
     results = dict(spread(dies_once, drives, count=2))
@@ -221,7 +219,7 @@ def test_the_drive_of_a_killed_worker_is_run_again(tmp_path: Path) -> None:
     assert results == {n: Outcome(drives[n], tmp_path / str(n), "whole") for n in (0, 1, 3)}
 
 
-def test_a_drive_ends_with_its_worker(tmp_path: Path) -> None:
+def test_a_drive_ends_with_its_worker(tmp_path: Path):
     """Its standard input is closed as by the death of the worker; else it would wait for images for an hour."""
     words = [str(tmp_path / "lock"), "live", "--dataset", str(tmp_path), "--wait", "3600"]
     command = [sys.executable, "-m", "slam.commands.batch", *words]

@@ -167,9 +167,7 @@ def require_close(camera: CameraFile, studio: Studio) -> None:
     ],
     ids=["opencv", "fisheye", "charuco"],
 )
-def test_a_known_camera_is_found(
-    tmp_path: Path, calibrate: Call, lens: dict, options: list[str]
-) -> None:
+def test_a_known_camera_is_found(tmp_path: Path, calibrate: Call, lens: dict, options: list[str]):
     studio = Studio(**lens)
     folder = write_views(tmp_path / "board", studio, spread(12, 40))
     code, out, err = calibrate(folder, "--board", "9x6", *options)
@@ -185,7 +183,7 @@ def test_a_known_camera_is_found(
 
 
 @pytest.mark.slow
-def test_among_the_images_the_picture_is_none_of_them(tmp_path: Path, calibrate: Call) -> None:
+def test_among_the_images_the_picture_is_none_of_them(tmp_path: Path, calibrate: Call):
     small = Studio(width=240, height=180, camera=(195.0, 197.0, 124.0, 87.5), distortion=(0.0,) * 5)
     folder = write_views(tmp_path / "board", small, spread(10, 40))
     before = {path: path.read_bytes() for path in folder.iterdir()}
@@ -206,7 +204,7 @@ def test_among_the_images_the_picture_is_none_of_them(tmp_path: Path, calibrate:
 
 
 @pytest.mark.slow
-def test_a_video_gives_its_rate(tmp_path: Path, calibrate: Call) -> None:
+def test_a_video_gives_its_rate(tmp_path: Path, calibrate: Call):
     studio = Studio(distortion=(0.0,) * 5)
     path = tmp_path / "board.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25, (360, 270))
@@ -256,7 +254,7 @@ def test_a_video_gives_its_rate(tmp_path: Path, calibrate: Call) -> None:
 )
 def test_what_does_not_determine_the_camera_is_refused(
     tmp_path: Path, calibrate: Call, views: str, options: list[str], message: str
-) -> None:
+):
     chosen = {
         "frontal": lambda: spread(9, 2.0),
         "few": lambda: spread(3, 40),
@@ -274,7 +272,7 @@ def test_what_does_not_determine_the_camera_is_refused(
 
 def test_after_some_images_without_the_board_it_is_said_what_is_looked_for(
     caplog: pytest.LogCaptureFixture,
-) -> None:
+):
     """A search of 300 images takes minutes, and the board may have been counted by its squares."""
     images = ReadImages(80, 60, 12, lambda index: np.full((60, 80, 3), 20 * index, np.uint8))
     with pytest.raises(SlamError, match="0 of 12 images show"):

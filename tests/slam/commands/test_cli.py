@@ -60,7 +60,7 @@ assert not heavy, heavy
 """
 
 
-def test_help_of_every_verb_is_light() -> None:
+def test_help_of_every_verb_is_light():
     finished = subprocess.run(
         [sys.executable, "-c", HELP], capture_output=True, text=True, check=False
     )
@@ -79,7 +79,7 @@ def test_help_of_every_verb_is_light() -> None:
         "evaluate . --csv a",
     ],
 )
-def test_wrong_usage_exits_with_2(call: Call, words: str) -> None:
+def test_wrong_usage_exits_with_2(call: Call, words: str):
     code, out, err = call(*words.split())
     assert code == 2 and "Usage:" in out + err
 
@@ -105,16 +105,14 @@ def test_wrong_usage_exits_with_2(call: Call, words: str) -> None:
 )
 def test_a_known_error_is_one_line_and_exits_with_1(
     call: Call, arguments: list[str], words: str, tmp_path: Path
-) -> None:
+):
     code, out, err = call(*arguments)
     assert code == 1 and out == ""
     assert err.startswith("erfsfm-slam: ") and err.count("\n") == 1 and words in err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_run_prints_table_licence_and_place(
-    call: Call, kitti_root: Path, tiny_weights: Path
-) -> None:
+def test_run_prints_table_licence_and_place(call: Call, kitti_root: Path, tiny_weights: Path):
     arguments = ["run", "--dataset", kitti_root, "-s", "sim", "--weights", tiny_weights]
     arguments += ["--frames", "0:6", *QUICK]
     code, out, err = call(*arguments, "--output", "my run", "--set", "scale.mode=none", "--seed", 5)
@@ -146,7 +144,7 @@ def test_run_prints_table_licence_and_place(
 
 def test_run_prints_interpolated_gaps(
     call: Call, copy_of_kitti_root: Callable[[], Path], tiny_weights: Path
-) -> None:
+):
     root = copy_of_kitti_root()
     (root / "sequences" / "sim" / "image_2" / "000007.png").write_bytes(b"no image")
     code, out, _ = call(
@@ -157,7 +155,7 @@ def test_run_prints_interpolated_gaps(
 
 def test_a_run_without_truth_has_no_table_of_dashes(
     call: Call, copy_of_kitti_root: Callable[[], Path], tiny_weights: Path
-) -> None:
+):
     root = copy_of_kitti_root()
     (root / "poses" / "sim.txt").unlink()
     code, out, _ = call(
@@ -170,9 +168,7 @@ def test_a_run_without_truth_has_no_table_of_dashes(
     assert "–" not in out and "14 frames in" in out
 
 
-def test_run_stamps_a_leak_and_prints_json(
-    call: Call, kitti_root: Path, leaky_weights: Path
-) -> None:
+def test_run_stamps_a_leak_and_prints_json(call: Call, kitti_root: Path, leaky_weights: Path):
     arguments = ["run", "--dataset", kitti_root, "--weights", leaky_weights, "--frames", "0:6"]
     arguments += QUICK
     assert "LEAK" in call(*arguments)[1]
@@ -181,7 +177,7 @@ def test_run_stamps_a_leak_and_prints_json(
     assert Path("results/latest").resolve().name.endswith("_sim")
 
 
-def test_an_interrupted_run_says_so(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_run_says_so(call: Call, monkeypatch: pytest.MonkeyPatch):
     def interrupt(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
@@ -195,7 +191,7 @@ def files_of(run: RunFolder, kind: str = "tum") -> tuple[Path, Path]:
 
 
 @pytest.mark.parametrize("kind", ["tum", pytest.param("kitti", marks=pytest.mark.slow)])
-def test_evaluate_files(call: Call, make_run: MakeRun, kind: str) -> None:
+def test_evaluate_files(call: Call, make_run: MakeRun, kind: str):
     estimate, reference = files_of(make_run(), kind)
     code, out, _ = call("evaluate", estimate, reference, "--json")
     expected = trajectory_metrics(
@@ -208,7 +204,7 @@ def test_evaluate_files(call: Call, make_run: MakeRun, kind: str) -> None:
     assert f"evo_ape {kind} " in table and "--align --correct_scale" in table
 
 
-def test_fail_over(call: Call, make_run: MakeRun) -> None:
+def test_fail_over(call: Call, make_run: MakeRun):
     files = files_of(make_run())
     assert call("evaluate", *files, "--fail-over", "ate_rmse_m=1000")[0] == 0
     code, out, err = call(
@@ -226,7 +222,7 @@ def test_fail_over(call: Call, make_run: MakeRun) -> None:
         assert code == 2 and words in " ".join(err.split())
 
 
-def test_rows_without_stamps_have_those_of_a_file_of_times(call: Call, make_run: MakeRun) -> None:
+def test_rows_without_stamps_have_those_of_a_file_of_times(call: Call, make_run: MakeRun):
     run = make_run().path
     rows = (run / "trajectory_optimised.tum.txt").read_text().splitlines()[1:]
     Path("half.txt").write_text("\n".join(rows[::2]))
@@ -236,7 +232,7 @@ def test_rows_without_stamps_have_those_of_a_file_of_times(call: Call, make_run:
     assert (code, json.loads(out)["align"]["none"]["ate_rmse_m"]) == (0, pytest.approx(0, abs=1e-6))
 
 
-def test_evaluate_runs_side_by_side(call: Call, make_run: MakeRun) -> None:
+def test_evaluate_runs_side_by_side(call: Call, make_run: MakeRun):
     runs = [make_run(name).path for name in ("morning", "evening")]
     code, out, _ = call("evaluate", *runs)
     assert code == 0 and "morning" in out and "evening" in out and "optimised" in out
@@ -245,7 +241,7 @@ def test_evaluate_runs_side_by_side(call: Call, make_run: MakeRun) -> None:
     )
 
 
-def test_evaluate_systems_against_one_reference(call: Call, make_run: MakeRun) -> None:
+def test_evaluate_systems_against_one_reference(call: Call, make_run: MakeRun):
     """Files and runs in one table; several of one name as mean and deviation; frames and CSV."""
     run = make_run("ours")
     for k in range(3):
@@ -299,12 +295,12 @@ def test_evaluate_systems_against_one_reference(call: Call, make_run: MakeRun) -
     assert code == 1 and "choose another" in err
 
 
-def test_the_printed_configuration_reads_back(call: Call) -> None:
+def test_the_printed_configuration_reads_back(call: Call):
     Path("mine.yaml").write_text(call("config")[1])
     assert load_config("mine.yaml") == load_config()
 
 
-def test_old_command_lines_with_seed_and_device_still_work(call: Call, make_run: MakeRun) -> None:
+def test_old_command_lines_with_seed_and_device_still_work(call: Call, make_run: MakeRun):
     run = make_run()
     for words in (
         ("evaluate", *files_of(run)),
@@ -315,7 +311,7 @@ def test_old_command_lines_with_seed_and_device_still_work(call: Call, make_run:
 
 
 @pytest.mark.slow
-def test_localize_prints_a_row_an_image(call: Call, kitti_root: Path, tiny_weights: Path) -> None:
+def test_localize_prints_a_row_an_image(call: Call, kitti_root: Path, tiny_weights: Path):
     run = ["run", "--dataset", kitti_root, "--weights", tiny_weights, "--output", "run", *QUICK]
     assert call(*run)[0] == 0
     images = kitti_root / "sequences" / "sim" / "image_2"
@@ -341,7 +337,7 @@ def test_localize_prints_a_row_an_image(call: Call, kitti_root: Path, tiny_weigh
 
 
 @pytest.mark.slow
-def test_simulate_writes_a_root_that_runs(call: Call, tiny_weights: Path) -> None:
+def test_simulate_writes_a_root_that_runs(call: Call, tiny_weights: Path):
     size = ("--width", 104, "--height", 32, "--frames", 8, "--route", "straight", "--seed", 1003)
     code, out, err = call(
         "simulate", "world", *size, "--depth", "--lidar", "--hazards", "rain,exposure"
@@ -353,7 +349,7 @@ def test_simulate_writes_a_root_that_runs(call: Call, tiny_weights: Path) -> Non
     assert call("run", "--dataset", "world", "--weights", tiny_weights, *QUICK)[0] == 0
 
 
-def test_doctor(call: Call, kitti_root: Path) -> None:
+def test_doctor(call: Call, kitti_root: Path):
     code, out, _ = call("doctor", "--dataset", kitti_root)
     assert code == 0 and "sequence sim: 14 frames" in out
     code, out, _ = call("doctor", "--dataset", "nowhere")
@@ -362,6 +358,6 @@ def test_doctor(call: Call, kitti_root: Path) -> None:
     assert code == 1 and "700" in out.splitlines()[-1]
 
 
-def test_a_request_names_its_recording(tmp_path: Path) -> None:
+def test_a_request_names_its_recording(tmp_path: Path):
     given = RunRequest.of(dataset=str(tmp_path), camera="fov=70", frames="0:9")
     assert given.recording == {"dataset": str(tmp_path), "camera": "fov=70", "frames": "0:9"}

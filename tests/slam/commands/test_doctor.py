@@ -23,7 +23,7 @@ def finding(lines: list[str], word: str) -> str:
     return line
 
 
-def test_every_line_is_ok_or_missing() -> None:
+def test_every_line_is_ok_or_missing():
     lines = examine(None)
     assert all(line.split()[0] in ("ok", "missing") and "\n" not in line for line in lines)
     for name in ("python", "torch", "gtsam", "kiss-icp", "evo", "opencv-python-headless", "open3d"):
@@ -31,7 +31,7 @@ def test_every_line_is_ok_or_missing() -> None:
     assert finding(lines, "KITTI_ODOMETRY").startswith("missing")
 
 
-def test_packages_that_take_seconds_are_not_imported() -> None:
+def test_packages_that_take_seconds_are_not_imported():
     program = (
         "import sys; from slam.commands.doctor import examine; examine(None); "
         "print(*{'torch', 'lightning', 'evo', 'matplotlib', 'dash'} & set(sys.modules))"
@@ -42,9 +42,7 @@ def test_packages_that_take_seconds_are_not_imported() -> None:
     assert finished.stdout.split() == []
 
 
-def test_weights_are_named_with_their_licence(
-    monkeypatch: pytest.MonkeyPatch, tiny_weights: Path
-) -> None:
+def test_weights_are_named_with_their_licence(monkeypatch: pytest.MonkeyPatch, tiny_weights: Path):
     monkeypatch.setattr(doctor, "WEIGHTS", ("nowhere", str(tiny_weights)))
     lines = examine(None)
     assert finding(lines, "weights nowhere").startswith("missing")
@@ -53,9 +51,7 @@ def test_weights_are_named_with_their_licence(
 
 
 @pytest.mark.parametrize("how", ["IMPORTED", "LOOKED_UP"])
-def test_a_missing_package_comes_with_its_installation(
-    monkeypatch: pytest.MonkeyPatch, how: str
-) -> None:
+def test_a_missing_package_comes_with_its_installation(monkeypatch: pytest.MonkeyPatch, how: str):
     monkeypatch.setattr(doctor, how, {"no-such-package": "no_such_package"})
     line = finding(examine(None), "no-such-package:")
     assert line.startswith("missing") and "pip install" in line
@@ -64,14 +60,14 @@ def test_a_missing_package_comes_with_its_installation(
 @pytest.mark.parametrize("by_variable", [False, True])
 def test_a_data_set_sequence_by_sequence(
     kitti_root: Path, by_variable: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     if by_variable:
         monkeypatch.setenv("KITTI_ODOMETRY", str(kitti_root))
     line = finding(examine(None if by_variable else kitti_root), "sequence sim")
     assert line.startswith("ok") and "14 frames of 208x64, true poses, camera 1.54 m high" in line
 
 
-def test_a_sequence_that_cannot_be_opened_says_why(copy_of_kitti_root: Callable[[], Path]) -> None:
+def test_a_sequence_that_cannot_be_opened_says_why(copy_of_kitti_root: Callable[[], Path]):
     root = copy_of_kitti_root()
     (root / "sequences" / "sim" / "calib.txt").unlink()
     line = finding(examine(root), "sequence sim")

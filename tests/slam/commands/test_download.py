@@ -160,7 +160,7 @@ WHOLE = {
 }
 
 
-def test_only_the_sequence_is_fetched(tmp_path: Path, server: Server, download: Call) -> None:
+def test_only_the_sequence_is_fetched(tmp_path: Path, server: Server, download: Call):
     code, out, err = download(*KITTI)
     assert code == 0, err
     assert "NonCommercial" in out and "7 files in" in out and "--sequence 09" in out
@@ -172,7 +172,7 @@ def test_only_the_sequence_is_fetched(tmp_path: Path, server: Server, download: 
 
 def test_what_is_there_is_not_fetched_again_and_what_is_damaged_is(
     tmp_path: Path, server: Server, download: Call
-) -> None:
+):
     download(*KITTI)
     damaged = tmp_path / "to/dataset/sequences/09/image_2/000001.png"
     damaged.write_bytes(b"x" * len(damaged.read_bytes()))
@@ -185,7 +185,7 @@ def test_what_is_there_is_not_fetched_again_and_what_is_damaged_is(
     assert len(server.asked) == tables + 1  # a table of contents each, and one image
 
 
-def test_grey_images_scans_and_sequences_without_poses(tmp_path: Path, download: Call) -> None:
+def test_grey_images_scans_and_sequences_without_poses(tmp_path: Path, download: Call):
     assert download(*KITTI, "--camera", "grey", "--lidar")[0] == 0
     assert {
         "dataset/sequences/09/image_0/000000.png",
@@ -198,7 +198,7 @@ def test_grey_images_scans_and_sequences_without_poses(tmp_path: Path, download:
 @pytest.mark.parametrize("cut_from", [0, 4])
 def test_one_that_keeps_breaking_is_named_and_goes_on_later(
     tmp_path: Path, server: Server, download: Call, cut_from: int
-) -> None:
+):
     server.cuts_left, server.cut_from = 10**6, cut_from
     code, _, err = download(*KITTI)
     assert code == 1 and re.search(
@@ -216,14 +216,14 @@ def test_one_that_keeps_breaking_is_named_and_goes_on_later(
         ("archives", "is no address: give --mirror as https://HOST/FOLDER"),
     ],
 )
-def test_no_server_at_all(download: Call, mirror: str, message: str) -> None:
+def test_no_server_at_all(download: Call, mirror: str, message: str):
     code, _, err = download(*KITTI, "--mirror", mirror)
     assert code == 1 and re.search(message, err) and len(err.splitlines()) == 1, err
 
 
 def test_bytes_that_do_not_fit_their_crc_are_not_kept(
     tmp_path: Path, server: Server, download: Call
-) -> None:
+):
     data = server.files["data_odometry_color.zip"]
     start = data.index(b"dataset/sequences/09/image_2/000000.png") + 60
     server.files["data_odometry_color.zip"] = data[:start] + bytes(200) + data[start + 200 :]
@@ -234,7 +234,7 @@ def test_bytes_that_do_not_fit_their_crc_are_not_kept(
 
 def test_members_that_lead_out_of_the_folder_are_refused(
     tmp_path: Path, server: Server, download: Call
-) -> None:
+):
     server.files["data_odometry_color.zip"] = zipped(
         {"dataset/sequences/09/image_2/../../../../../out.png": b"x"}
     )
@@ -245,7 +245,7 @@ def test_members_that_lead_out_of_the_folder_are_refused(
 
 def test_a_server_without_ranges_is_named_and_nothing_is_kept(
     tmp_path: Path, server: Server, download: Call
-) -> None:
+):
     server.gives_ranges = False
     code, _, err = download(*KITTI)
     assert code == 1 and "gives no parts of files" in err and not found(tmp_path / "to")

@@ -41,7 +41,7 @@ MakeRecorded = Callable[..., RunFolder]
 @pytest.mark.parametrize("what", ["mesh", "cloud"])
 def test_ply_is_written_as_it_is_or_rotated_into_a_new_folder(
     make_run: MakeRun, tmp_path: Path, what: str
-) -> None:
+):
     folder = make_run()
     source = folder.path / f"map_{what}.ply"
     copied = export(folder, what, tmp_path / "new" / "a.ply")
@@ -58,13 +58,13 @@ def keep_places(folder: RunFolder) -> None:
     folder.write(PLACES, Places(camera, (), np.zeros((0, 4, 4))).write)
 
 
-def test_an_option_without_effect_is_refused(make_run: MakeRun, tmp_path: Path) -> None:
+def test_an_option_without_effect_is_refused(make_run: MakeRun, tmp_path: Path):
     with pytest.raises(RunError, match="--points does nothing for mesh: it is for colmap"):
         export(make_run(), "mesh", tmp_path / "mesh.ply", points=5)
 
 
 @pytest.mark.parametrize("up", ["y-down", "z"])
-def test_colmap_has_camera_poses_and_cloud(make_run: MakeRun, tmp_path: Path, up: str) -> None:
+def test_colmap_has_camera_poses_and_cloud(make_run: MakeRun, tmp_path: Path, up: str):
     folder = make_run()
     keep_places(folder)
     written = export(folder, "colmap", tmp_path / "new" / "model", up)
@@ -98,7 +98,7 @@ def test_colmap_has_camera_poses_and_cloud(make_run: MakeRun, tmp_path: Path, up
 )
 def test_nothing_else_is_replaced(
     make_run: MakeRun, tmp_path: Path, what: str, name: str, why: str
-) -> None:
+):
     folder = make_run()
     (tmp_path / "drive/images").mkdir(parents=True)
     (tmp_path / "folder.ply").mkdir()
@@ -113,9 +113,7 @@ def test_nothing_else_is_replaced(
 
 
 @pytest.mark.parametrize(("what", "missing"), [("mesh", "map_mesh.ply"), ("colmap", "places.npz")])
-def test_a_part_the_run_lacks_is_named(
-    make_run: MakeRun, tmp_path: Path, what: str, missing: str
-) -> None:
+def test_a_part_the_run_lacks_is_named(make_run: MakeRun, tmp_path: Path, what: str, missing: str):
     folder = make_run()
     keep_places(folder)
     (folder.path / missing).unlink()
@@ -123,7 +121,7 @@ def test_a_part_the_run_lacks_is_named(
         export(folder, what, tmp_path / "out.ply")
 
 
-def test_a_map_that_is_cut_short_is_not_exported(make_run: MakeRun, tmp_path: Path) -> None:
+def test_a_map_that_is_cut_short_is_not_exported(make_run: MakeRun, tmp_path: Path):
     folder = make_run()
     mesh = folder.path / "map_mesh.ply"
     mesh.write_bytes(mesh.read_bytes()[:-12])
@@ -132,7 +130,7 @@ def test_a_map_that_is_cut_short_is_not_exported(make_run: MakeRun, tmp_path: Pa
     assert not (tmp_path / "out.ply").exists()
 
 
-def test_an_estimate_that_lacks_rows_is_not_exported(make_run: MakeRun, tmp_path: Path) -> None:
+def test_an_estimate_that_lacks_rows_is_not_exported(make_run: MakeRun, tmp_path: Path):
     folder = make_run()
     keep_places(folder)
     path = folder.path / "trajectory_optimised.tum.txt"
@@ -144,13 +142,13 @@ def test_an_estimate_that_lacks_rows_is_not_exported(make_run: MakeRun, tmp_path
     assert not (tmp_path / "out").exists()
 
 
-def test_a_grid_of_too_many_cells_is_one_line(make_recorded: MakeRun, tmp_path: Path) -> None:
+def test_a_grid_of_too_many_cells_is_one_line(make_recorded: MakeRun, tmp_path: Path):
     with pytest.raises(RunError, match=r"--resolution 1e-05 gives .* cells"):
         export(make_recorded(), "occupancy", tmp_path / "new" / "map.yaml", resolution=1e-5)
     assert not (tmp_path / "new").exists()
 
 
-def test_an_empty_map_is_not_exported(make_recorded: MakeRun, tmp_path: Path) -> None:
+def test_an_empty_map_is_not_exported(make_recorded: MakeRun, tmp_path: Path):
     folder = make_recorded()
     nothing = np.zeros((0, 3))
     write_ply(
@@ -191,7 +189,7 @@ def rows(path: Path) -> list[list[str]]:
 
 def test_corners_are_tracked_through_the_images(
     run: RunFolder, street: SimulatedSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     model = export(run, "colmap", tmp_path / "model")
     assert "does not record where its images are: the model has none" in caplog.text
     points, images = rows(model / "points3D.txt"), rows(model / "images.txt")
@@ -213,7 +211,7 @@ def test_corners_are_tracked_through_the_images(
     assert np.median(street.street.distance_to_surface(apply(T_street_first, X))) < 0.5
 
 
-def test_points_are_chosen_by_the_length_of_their_tracks(run: RunFolder, tmp_path: Path) -> None:
+def test_points_are_chosen_by_the_length_of_their_tracks(run: RunFolder, tmp_path: Path):
     whole = [len(point) for point in rows(export(run, "colmap", tmp_path / "all") / "points3D.txt")]
     few = rows(export(run, "colmap", tmp_path / "few", "z", points=20) / "points3D.txt")
     assert [len(point) for point in few] == sorted(whole, reverse=True)[:20]
@@ -229,7 +227,7 @@ def scene(folder: Path) -> dict[str, Any]:
 @pytest.mark.parametrize("up", ["y-down", "z"])
 def test_points_project_to_their_pixels(
     make_recorded: MakeRecorded, sheet: Ply, tmp_path: Path, up: str
-) -> None:
+):
     """By the convention of the format alone: x right, y up, z backwards, pixel centres at a half."""
     folder = make_recorded()
     written = export(folder, "nerfstudio", tmp_path / "scene", up)
@@ -254,7 +252,7 @@ def test_points_project_to_their_pixels(
         )
 
 
-def test_images_of_a_lens_are_undistorted(make_recorded: MakeRecorded, tmp_path: Path) -> None:
+def test_images_of_a_lens_are_undistorted(make_recorded: MakeRecorded, tmp_path: Path):
     folder = make_recorded()
     camera_file = tmp_path / "drive" / "camera.yaml"
     lens = "model: opencv\ndistortion: [-0.3, 0, 0, 0]\nfx_sigma: 0.1\n"
@@ -271,7 +269,7 @@ def test_images_of_a_lens_are_undistorted(make_recorded: MakeRecorded, tmp_path:
 
 def test_frames_without_a_usable_image_are_left_out(
     make_recorded: MakeRecorded, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     folder = make_recorded(broken=(2,), bridged=(5,))
     (folder.path / "map_cloud.ply").unlink()
     written, sequence = (
@@ -296,7 +294,7 @@ def test_frames_without_a_usable_image_are_left_out(
 
 def test_interpolated_frames_are_no_images_of_a_colmap_model(
     make_recorded: MakeRecorded, tmp_path: Path
-) -> None:
+):
     model = export(make_recorded(bridged=(5,)), "colmap", tmp_path / "model")
     images = [line.split() for line in (model / "images.txt").read_text().splitlines()[1::2]]
     assert [(row[0], row[-1]) for row in images] == [
@@ -304,7 +302,7 @@ def test_interpolated_frames_are_no_images_of_a_colmap_model(
     ]
 
 
-def test_a_run_of_a_part_finds_its_frames(make_recorded: MakeRecorded, tmp_path: Path) -> None:
+def test_a_run_of_a_part_finds_its_frames(make_recorded: MakeRecorded, tmp_path: Path):
     folder = make_recorded()
     trajectory = folder.trajectory("optimised")
     folder.write_trajectory(
@@ -323,7 +321,7 @@ def test_a_run_of_a_part_finds_its_frames(make_recorded: MakeRecorded, tmp_path:
 
 def test_images_that_have_gone_are_one_line_and_a_new_place_is_taken(
     make_recorded: MakeRecorded, tmp_path: Path
-) -> None:
+):
     folder = make_recorded()
     shutil.move(tmp_path / "drive", tmp_path / "elsewhere")
     with pytest.raises(
@@ -342,9 +340,7 @@ def test_images_that_have_gone_are_one_line_and_a_new_place_is_taken(
 
 
 @pytest.mark.parametrize("name", ["map.yaml", "map.pgm"])
-def test_the_grid_of_a_run(
-    make_recorded: Callable[..., RunFolder], tmp_path: Path, name: str
-) -> None:
+def test_the_grid_of_a_run(make_recorded: Callable[..., RunFolder], tmp_path: Path, name: str):
     written = export(make_recorded(), "occupancy", tmp_path / "new" / name, "z", resolution=0.2)
     assert sorted(path.name for path in written.parent.iterdir()) == ["map.pgm", "map.yaml"]
     described = yaml.safe_load(written.read_text())
@@ -357,7 +353,7 @@ def test_the_grid_of_a_run(
 
 def test_a_grid_without_metres_says_so(
     make_recorded: Callable[..., RunFolder], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+):
     folder, output = make_recorded(), tmp_path / "map.yaml"
     words = ["export", str(folder.path), "--what", "occupancy", "--output", str(output)]
     for unit, note in (("camera heights", True), ("metres", False)):

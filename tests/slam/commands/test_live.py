@@ -94,7 +94,7 @@ def filled(
 
 def test_a_folder_being_filled_gives_the_bytes_of_a_run(
     street: Path, tiny_weights: Path, tmp_path: Path
-) -> None:
+):
     target, messages = filled(street, tmp_path)
     request = request_of(target, tiny_weights, SETTINGS, tmp_path / "live", wait=600)
     folder = run_live(request, messages.append)
@@ -129,7 +129,7 @@ def test_without_a_road_there_are_no_metres_and_no_camera_heights(
     mode: str,
     unit: str | None,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:
+):
     monkeypatch.setattr("slam.frontend.ground_plane._ROAD_ROWS", (0.0, 0.001))  # at the horizon
     monkeypatch.setattr("slam.frontend.road._MIN_POINTS", 10**6)  # of the homography
     target, messages = filled(street, tmp_path)
@@ -148,7 +148,7 @@ def test_without_a_road_there_are_no_metres_and_no_camera_heights(
 
 def test_broken_images_are_left_out_and_a_folder_that_vanishes_leaves_a_whole_run(
     street: Path, tiny_weights: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     cut = sorted((street / "images").iterdir())[5].read_bytes()[:2000]
     small = cv2.imencode(".png", np.zeros((20, 30, 3), np.uint8))[1].tobytes()
     target, messages = filled(street, tmp_path, broken={5: cut, 8: small})
@@ -173,7 +173,7 @@ def test_broken_images_are_left_out_and_a_folder_that_vanishes_leaves_a_whole_ru
 
 def test_images_that_are_there_are_dropped_and_counted_unless_every_one_is_wanted(
     street: Path, tiny_weights: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     messages: list[dict[str, Any]] = []
     request = request_of(street / "images", tiny_weights, SETTINGS, tmp_path / "live", wait=0.5)
     try:  # while the first one is measured, most others come: how many frames are left depends on the machine
@@ -201,7 +201,7 @@ def test_images_that_are_there_are_dropped_and_counted_unless_every_one_is_wante
 )
 def test_what_the_settings_need_is_asked_before_the_first_frame(
     street: Path, tiny_weights: Path, tmp_path: Path, settings: tuple[str, ...], words: str
-) -> None:
+):
     """A camera by its field of view alone has no height; frames that come have no scans and no numbers."""
     settings = (*SETTINGS, *settings)
     images, messages = str(street / "images"), []
@@ -215,7 +215,7 @@ def test_what_the_settings_need_is_asked_before_the_first_frame(
 
 def test_the_password_of_an_address_is_written_nowhere(
     street: Path, tiny_weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     address = "rtsp://me:hush@camera/drive?pwd=quiet&x=1"
     images, opened, capture = str(street / "images" / "%06d.png"), [], cv2.VideoCapture
 
@@ -248,7 +248,7 @@ def test_the_password_of_an_address_is_written_nowhere(
 @pytest.mark.parametrize("frames", [2, 9])
 def test_a_drive_that_fails_leaves_the_poses_that_it_had(
     street: Path, tiny_weights: Path, tmp_path: Path, frames: int
-) -> None:
+):
     """After the last of two frames, which are too few, and at the ninth, which nobody listens to."""
     target, messages = filled(street, tmp_path, frames)
 
@@ -274,7 +274,7 @@ def test_a_drive_that_fails_leaves_the_poses_that_it_had(
 
 def test_the_viewer_is_shown_the_drive(
     street: Path, tiny_weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     """What it would show goes to a file, as it does without a screen."""
     rerun = pytest.importorskip("rerun", reason="the extra rerun is not installed")
     shown = tmp_path / "shown.rrd"
@@ -304,7 +304,7 @@ def test_the_viewer_is_shown_the_drive(
 )
 def test_a_signal_leaves_a_whole_run(
     street: Path, tiny_weights: Path, tmp_path: Path, number: signal.Signals
-) -> None:
+):
     output = tmp_path / "run"
     target, messages = filled(street, tmp_path, vanishes=False)
     command = [

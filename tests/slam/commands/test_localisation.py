@@ -87,7 +87,7 @@ def save(path: Path, image: Image) -> None:
 @pytest.mark.parametrize(
     "hazards", [pytest.param((), marks=pytest.mark.slow), ("rain",)]
 )  # the album has another exposure
-def test_images_of_the_street_are_localised_where_they_were_taken(hazards: tuple[str, ...]) -> None:
+def test_images_of_the_street_are_localised_where_they_were_taken(hazards: tuple[str, ...]):
     localiser = Localiser(places())
     found = 0
     for k in range(4, FRAMES - 4, 10):
@@ -106,7 +106,7 @@ def test_images_of_the_street_are_localised_where_they_were_taken(hazards: tuple
     assert found >= 3
 
 
-def test_wrong_learned_depth_is_replaced_by_what_neighbouring_places_measure() -> None:
+def test_wrong_learned_depth_is_replaced_by_what_neighbouring_places_measure():
     rng = np.random.default_rng(0)
     views = tuple(
         replace(
@@ -123,7 +123,7 @@ def test_wrong_learned_depth_is_replaced_by_what_neighbouring_places_measure() -
 
 
 @pytest.mark.slow
-def test_another_size_of_the_same_camera_is_found_too() -> None:
+def test_another_size_of_the_same_camera_is_found_too():
     image = street(630).frame(31).image
     twice = np.asarray(cv2.resize(image, (624, 192), interpolation=cv2.INTER_CUBIC), np.uint8)
     assert Localiser(places()).locate("twice", twice).nearest_frame in (30, 33)
@@ -151,7 +151,7 @@ def bent(image: Image, camera: CameraFile) -> Image:
 )
 def test_images_of_a_lens_need_its_camera_file(
     run: RunFolder, tmp_path: Path, where: str | None, given: str
-) -> None:
+):
     """It is looked for where ``run`` looks."""
     run.write(
         PLACES, replace(places(), intrinsics=replace(places().intrinsics, undistorted=True)).write
@@ -180,7 +180,7 @@ def test_images_of_a_lens_need_its_camera_file(
     assert np.linalg.norm(found.T_world_camera[:3, 3] / UNIT - reference()[25, :3, 3]) < 0.5
 
 
-def test_a_camera_of_another_size_is_refused_image_by_image(run: RunFolder, album: Path) -> None:
+def test_a_camera_of_another_size_is_refused_image_by_image(run: RunFolder, album: Path):
     camera = album / "camera.yaml"
     lens = "model: opencv, distortion: [-0.1, 0, 0, 0]"
     camera.write_text(
@@ -196,7 +196,7 @@ def test_a_camera_of_another_size_is_refused_image_by_image(run: RunFolder, albu
 @pytest.mark.parametrize(
     "what", ["another street", "black", pytest.param("noise", marks=pytest.mark.slow)]
 )
-def test_images_of_other_places_are_refused(what: str) -> None:
+def test_images_of_other_places_are_refused(what: str):
     images = {
         "another street": [street(seed).frame(k).image for seed, k in ((631, 5), (632, 40))],
         "noise": [np.random.default_rng(0).integers(0, 255, (96, 312, 3), np.uint8)],
@@ -209,7 +209,7 @@ def test_images_of_other_places_are_refused(what: str) -> None:
 
 
 @pytest.mark.parametrize("zoom", [0.93, 1.1])
-def test_images_by_another_lens_are_refused_where_its_camera_is_not_given(zoom: float) -> None:
+def test_images_by_another_lens_are_refused_where_its_camera_is_not_given(zoom: float):
     camera = places().intrinsics
     middle = np.array([camera.cx, camera.cy])
     zoomed = np.column_stack([zoom * np.eye(2), (1.0 - zoom) * middle])
@@ -223,9 +223,7 @@ def test_images_by_another_lens_are_refused_where_its_camera_is_not_given(zoom: 
         assert np.linalg.norm(found[:3, 3] / UNIT - reference()[k, :3, 3]) < 0.5
 
 
-def test_a_folder_of_images_is_localised_in_a_run(
-    run: RunFolder, album: Path, tmp_path: Path
-) -> None:
+def test_a_folder_of_images_is_localised_in_a_run(run: RunFolder, album: Path, tmp_path: Path):
     found = localise(album, run)
     assert [each.image for each in found] == ["10.png", "25.png", "40.png", "50.png", "60.png"]
     assert [each.T_world_camera is not None for each in found] == [True, True, True, False, False]
@@ -253,7 +251,7 @@ def test_a_folder_of_images_is_localised_in_a_run(
     np.testing.assert_allclose(pair[0].positions / UNIT, pair[1].positions, atol=0.5)
 
 
-def test_what_cannot_be_localised_is_one_line(run: RunFolder, album: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_localised_is_one_line(run: RunFolder, album: Path, tmp_path: Path):
     with pytest.raises(RunError, match="none of 1 images was found"):
         write_localisations(tmp_path / "found.tum", localise(album / "50.png", run))
     assert not (tmp_path / "found.tum").exists()

@@ -79,7 +79,7 @@ def reported(quick: dict[str, Any]) -> dict[str, Any]:
     return quick | {"overrides": quick["overrides"][:-1]}
 
 
-def test_every_file_and_every_number(run: RunFolder, check_run: CheckRun) -> None:
+def test_every_file_and_every_number(run: RunFolder, check_run: CheckRun):
     metrics = check_run(run.path)
     provenance = metrics["provenance"]
     assert (provenance["seed"], provenance["device"]) == (3, "cpu")
@@ -104,7 +104,7 @@ def test_every_file_and_every_number(run: RunFolder, check_run: CheckRun) -> Non
         assert "100 m" in metrics["trajectories"][name]["align"]["7dof"]["t_rel_percent_reason"]
 
 
-def test_the_report_and_the_log_describe_it(run: RunFolder) -> None:
+def test_the_report_and_the_log_describe_it(run: RunFolder):
     report = (run.path / "report.html").read_text()
     assert "none, untrained" in report and ">FAILED<" not in report and ">LEAK<" not in report
     assert not re.search(r"(src|href)=['\"]https?:", report)
@@ -116,7 +116,7 @@ def test_the_report_and_the_log_describe_it(run: RunFolder) -> None:
     )
 
 
-def test_the_snippets_of_the_network_are_its_direct_poses(run: RunFolder) -> None:
+def test_the_snippets_of_the_network_are_its_direct_poses(run: RunFolder):
     """Cut from the chain they would be other numbers: poses of an untrained network are inconsistent."""
     numbers = run.metrics().tree()["trajectories"]
     assert numbers["network"]["snippet5"]["ate_mean"] != numbers["odometry"]["snippet5"]["ate_mean"]
@@ -125,7 +125,7 @@ def test_the_snippets_of_the_network_are_its_direct_poses(run: RunFolder) -> Non
 
 def test_without_map_and_truth_the_reasons_are_written(
     reported: dict[str, Any], copy_of_kitti_root: CopyRoot, check_run: CheckRun
-) -> None:
+):
     root = copy_of_kitti_root()
     (root / "poses" / "sim.txt").unlink()
     metrics = check_run(run_slam(**reported | {"dataset": root}).path)
@@ -137,7 +137,7 @@ def test_without_map_and_truth_the_reasons_are_written(
 
 def test_a_run_that_fails_says_why_and_leaves_nothing_of_the_one_before(
     reported: dict[str, Any], copy_of_kitti_root: CopyRoot, tmp_path: Path
-) -> None:
+):
     root, output = copy_of_kitti_root(), tmp_path / "failed"
     whole = set(contents(run_slam(**reported, output=output).path))
     for image in sorted((root / "sequences" / "sim" / "image_2").glob("*.png"))[3:]:
@@ -162,7 +162,7 @@ def test_a_run_that_fails_says_why_and_leaves_nothing_of_the_one_before(
 
 def test_an_unreadable_image_is_bridged_and_reported(
     reported: dict[str, Any], copy_of_kitti_root: CopyRoot, check_run: CheckRun
-) -> None:
+):
     root = copy_of_kitti_root()
     image = root / "sequences" / "sim" / "image_2" / "000006.png"
     image.write_bytes(image.read_bytes()[:200])
@@ -177,7 +177,7 @@ def test_an_unreadable_image_is_bridged_and_reported(
 @pytest.mark.slow
 def test_unreadable_scans_are_left_out_and_reported(
     reported: dict[str, Any], copy_of_kitti_root: CopyRoot, check_run: CheckRun
-) -> None:
+):
     root = copy_of_kitti_root()
     scans = root / "sequences/sim/velodyne"
     scans.mkdir()
@@ -215,7 +215,7 @@ def test_however_a_run_ends_its_folder_has_the_reason(
     monkeypatch: pytest.MonkeyPatch,
     error: BaseException,
     reason: str,
-) -> None:
+):
     def stop(self: SlamPipeline, *_: object) -> None:
         raise error
 
@@ -231,7 +231,7 @@ def test_an_untrained_pose_network_with_two_sources_runs(
     tmp_path: Path,
     write_weights: Callable[..., Path],
     check_run: CheckRun,
-) -> None:
+):
     metrics = check_run(
         run_slam(**reported | {"weights": write_weights(tmp_path / "three", sources=2)}).path
     )
@@ -256,7 +256,7 @@ def call(*arguments: object) -> int:
 
 def test_images_without_a_camera_leave_one_for_the_next_run(
     quick: dict[str, Any], kitti_root: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     shutil.copytree(kitti_root / "sequences" / "sim" / "image_2", tmp_path / "walk" / "images")
     given = quick | {"dataset": tmp_path / "walk", "sequence": None}
     found = run_slam(**given, output=tmp_path / "first").path / CAMERA_FILE
@@ -277,7 +277,7 @@ def test_images_without_a_camera_leave_one_for_the_next_run(
     assert kept is not None and (kept == fixed).mean() > 0.97
 
 
-def test_arguments_are_those_of_a_request_one_by_one() -> None:
+def test_arguments_are_those_of_a_request_one_by_one():
     """So that an editor and mypy know them."""
     assert RunOptions.__annotations__.keys() == RunRequest.model_fields.keys() - {
         "command",
@@ -291,7 +291,7 @@ def test_arguments_are_those_of_a_request_one_by_one() -> None:
 )
 def test_an_argument_of_another_kind_is_named(
     quick: dict[str, Any], option: dict[str, Any], tmp_path: Path
-) -> None:
+):
     with pytest.raises(RunError, match=f"run_slam: {next(iter(option))}: "):
         run_slam(**quick | {"output": tmp_path / "run"} | option)
     assert not (tmp_path / "run").exists()
@@ -299,16 +299,14 @@ def test_an_argument_of_another_kind_is_named(
 
 def test_a_folder_of_another_program_is_refused_before_any_work(
     quick: dict[str, Any], tmp_path: Path
-) -> None:
+):
     (tmp_path / "config.yaml").write_text("mine")
     with pytest.raises(RunError, match="not empty and holds no run"):
         run_slam(**quick | {"weights": tmp_path / "nowhere"}, output=tmp_path)
     assert contents(tmp_path) == {"config.yaml": b"mine"}
 
 
-def test_output_is_used_again_and_only_its_own_files_go(
-    quick: dict[str, Any], tmp_path: Path
-) -> None:
+def test_output_is_used_again_and_only_its_own_files_go(quick: dict[str, Any], tmp_path: Path):
     output = tmp_path / "mine"
     run_slam(**quick, output=output)
     (output / "map_mesh.ply").write_text("of an older run")
@@ -322,7 +320,7 @@ def test_output_is_used_again_and_only_its_own_files_go(
 
 def test_a_run_that_cannot_begin_leaves_an_earlier_one_as_it_is(
     quick: dict[str, Any], tmp_path: Path
-) -> None:
+):
     output = tmp_path / "run"
     run_slam(**quick, output=output)
     before = contents(output)
@@ -362,7 +360,7 @@ def test_a_stage_that_fails_costs_its_results(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
-) -> None:
+):
     def failing(*_: object, **__: object) -> None:
         raise KeyError(0)
 
@@ -403,7 +401,7 @@ def test_a_signal_during_the_pass_leaves_a_whole_run_of_what_was_seen(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
     name: str,
-) -> None:
+):
     def interrupted(self: FolderRecorder, observer: Observer) -> None:
         if observer.frames == 6:
             os.kill(os.getpid(), getattr(signal, name))
@@ -420,7 +418,7 @@ def test_a_signal_during_the_pass_leaves_a_whole_run_of_what_was_seen(
 
 def test_a_signal_before_the_first_snippet_ends_a_run(
     quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     monkeypatch.setattr(FolderRecorder, "frame", lambda *_: os.kill(os.getpid(), signal.SIGTERM))
     with pytest.raises(SlamError, match="interrupted after 1 frames"):
         run_slam(**quick, output=tmp_path / "run")
@@ -429,7 +427,7 @@ def test_a_signal_before_the_first_snippet_ends_a_run(
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_a_terminated_run_has_its_reason(
     quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
+):
     def terminated(self: SlamPipeline, *_: object) -> None:
         os.kill(os.getpid(), getattr(signal, name))
 
@@ -463,7 +461,7 @@ def test_a_run_that_was_killed_in_its_map_can_be_used_and_replaced(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     caplog: pytest.LogCaptureFixture,
-) -> None:
+):
     output = tmp_path / "run"
     arguments = [str(quick["dataset"]), str(quick["weights"]), str(output)]
     assert (
@@ -504,7 +502,7 @@ def test_a_run_that_was_killed_in_its_map_can_be_used_and_replaced(
     assert RunFolder.open(output).metrics().tree()["status"] == "ok"
 
 
-def test_two_runs_into_one_folder(quick: dict[str, Any], tmp_path: Path) -> None:
+def test_two_runs_into_one_folder(quick: dict[str, Any], tmp_path: Path):
     output, refused = tmp_path / "run", []
 
     def second(*_: object) -> None:

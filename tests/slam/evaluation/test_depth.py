@@ -6,14 +6,14 @@ from slam.evaluation.depth import DepthErrors
 TRUTH = np.full((20, 40), 10.0, np.float32)
 
 
-def test_no_truth_gives_no_numbers() -> None:
+def test_no_truth_gives_no_numbers():
     errors = DepthErrors()
     errors.add(TRUTH, np.zeros_like(TRUTH))
     errors.add(TRUTH, np.full_like(TRUTH, 81.0))
     assert errors.metrics() is None
 
 
-def test_numbers_of_a_constant_error() -> None:
+def test_numbers_of_a_constant_error():
     errors = DepthErrors()
     errors.add(TRUTH * 1.1, TRUTH)
     errors.add(TRUTH * 0.7, TRUTH)
@@ -25,7 +25,7 @@ def test_numbers_of_a_constant_error() -> None:
     assert summary["coverage"] is None and summary["coverage_reason"]
 
 
-def test_errors_by_range() -> None:
+def test_errors_by_range():
     truth = TRUTH.copy()
     truth[:, :20] = 30
     errors = DepthErrors()
@@ -34,7 +34,7 @@ def test_errors_by_range() -> None:
     assert by_range == pytest.approx({"10-20": 2.3, "20-40": 0.1})
 
 
-def test_correct_sigmas_cover() -> None:
+def test_correct_sigmas_cover():
     rng = np.random.default_rng(0)
     errors = DepthErrors()
     for _ in range(20):
@@ -46,7 +46,7 @@ def test_correct_sigmas_cover() -> None:
         assert summary["coverage"][str(level)] == pytest.approx(level / 100, abs=0.02)
 
 
-def test_truth_of_another_size_meets_the_nearest_pixel() -> None:
+def test_truth_of_another_size_meets_the_nearest_pixel():
     depth = np.repeat(np.arange(1.0, 11.0, dtype=np.float32), 4)[None].repeat(8, axis=0)  # (8, 40)
     errors = DepthErrors()
     errors.add(depth, np.repeat(np.repeat(depth, 2, axis=0), 2, axis=1))
@@ -54,7 +54,7 @@ def test_truth_of_another_size_meets_the_nearest_pixel() -> None:
     assert summary["abs_rel"] == 0
 
 
-def test_pixels_without_an_estimate_are_not_compared() -> None:
+def test_pixels_without_an_estimate_are_not_compared():
     truth = np.full((4, 4), 10, np.float32)
     depth = np.full((4, 4), 11, np.float32)
     depth[0], depth[1] = 0, np.nan
@@ -67,14 +67,14 @@ def test_pixels_without_an_estimate_are_not_compared() -> None:
     assert (summary["coverage"]["50"], summary["coverage"]["90"]) == (0.0, 1.0)
 
 
-def test_an_estimate_beyond_the_range_counts_as_its_end() -> None:
+def test_an_estimate_beyond_the_range_counts_as_its_end():
     errors = DepthErrors()
     errors.add(np.full_like(TRUTH, 4000.0), np.full_like(TRUTH, 64.0))
     summary = errors.metrics().tree()
     assert summary["abs_rel"] == pytest.approx(0.25)
 
 
-def test_of_a_long_drive_evenly_spread_frames_are_held() -> None:
+def test_of_a_long_drive_evenly_spread_frames_are_held():
     errors = DepthErrors()
     for k in range(3001):
         errors.add(TRUTH * (1 + k / 3000), TRUTH)

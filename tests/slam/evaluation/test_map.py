@@ -79,7 +79,7 @@ def errors(points: FloatArray, exact: bool = False) -> dict[str, Any]:
 )
 def test_a_raised_plane_is_wrong_by_its_offset(
     offset_m: float, covered: float, f_scores: tuple[float, float], exact: bool
-) -> None:
+):
     found = errors(road() - [0.0, offset_m, 0.0], exact)
     assert found["accuracy_median_m"] == pytest.approx(offset_m, abs=CLOSE_M)
     assert found["accuracy_90_m"] == pytest.approx(offset_m, abs=CLOSE_M)
@@ -88,7 +88,7 @@ def test_a_raised_plane_is_wrong_by_its_offset(
     assert found["outlier_share"] == 0.0
 
 
-def test_half_a_plane_is_accurate_and_half_complete() -> None:
+def test_half_a_plane_is_accurate_and_half_complete():
     points = road()
     found = errors(points[points[:, 0] < 0])
     assert found["accuracy_median_m"] == pytest.approx(0.0, abs=CLOSE_M)
@@ -98,7 +98,7 @@ def test_half_a_plane_is_accurate_and_half_complete() -> None:
     assert found["f_score"]["0.5"] == pytest.approx(2 * recall / (1 + recall), abs=0.02)
 
 
-def test_density_does_not_weigh() -> None:
+def test_density_does_not_weigh():
     points = road()
     good, bad = points[points[:, 0] < 0], points[points[:, 0] >= 0] - [0.0, 2.0, 0.0]
     found = errors(np.concatenate([np.repeat(good, 20, axis=0), bad]))
@@ -109,7 +109,7 @@ def test_density_does_not_weigh() -> None:
 
 
 @pytest.mark.slow
-def test_the_curve_is_over_the_distance_from_the_nearest_camera() -> None:
+def test_the_curve_is_over_the_distance_from_the_nearest_camera():
     points = road(36.0)
     points[np.abs(points[:, 0]) > 9.0, 1] -= 0.35
     truth = Road(road(36.0), np.arange(21))
@@ -129,7 +129,7 @@ def test_the_curve_is_over_the_distance_from_the_nearest_camera() -> None:
     assert "too few" in beyond["f_score"]["0.2_reason"] and beyond["completeness"] is None
 
 
-def test_an_empty_map_has_reasons_and_covers_nothing() -> None:
+def test_an_empty_map_has_reasons_and_covers_nothing():
     found = errors(np.array([[0.0, 90.0, 0.0]]))
     assert found["completeness"] == 0.0 and found["accuracy_median_m"] is None
     assert (
@@ -138,7 +138,7 @@ def test_an_empty_map_has_reasons_and_covers_nothing() -> None:
     )
 
 
-def test_only_the_road_of_known_surface_counts() -> None:
+def test_only_the_road_of_known_surface_counts():
     truth = Road(road(), np.arange(21))
     distances, length_m = compare(
         truth,
@@ -149,7 +149,7 @@ def test_only_the_road_of_known_surface_counts() -> None:
     assert length_m == pytest.approx(26.0)
 
 
-def test_a_long_drive_is_sampled_evenly() -> None:
+def test_a_long_drive_is_sampled_evenly():
     T_world_camera = straight(5000)
     parts = stretches(T_world_camera, np.arange(5000))
     assert len(parts) == 5 and all(len(part) == 100 for part in parts)
@@ -160,7 +160,7 @@ def test_a_long_drive_is_sampled_evenly() -> None:
     assert truth.views <= 5 * 201
 
 
-def test_a_point_in_an_image_takes_the_place_of_one_beside_it() -> None:
+def test_a_point_in_an_image_takes_the_place_of_one_beside_it():
     class Views(Road):
         def view(self, frame: int) -> Surface:
             return Surface(self.points[frame : frame + 1], np.array([frame == 1]))
@@ -171,7 +171,7 @@ def test_a_point_in_an_image_takes_the_place_of_one_beside_it() -> None:
     assert surface.in_image.tolist() == [True, False]
 
 
-def test_depth_becomes_points_in_the_world() -> None:
+def test_depth_becomes_points_in_the_world():
     rays = Intrinsics(21, 11, 50.0, 50.0, 10.0, 5.0).rays(
         Intrinsics(21, 11, 50.0, 50.0, 10.0, 5.0).pixel_grid()
     )
@@ -193,7 +193,7 @@ def drive(frames: int = 40) -> FloatArray:
     return se3.chain(np.tile(step, (frames - 1, 1, 1)))
 
 
-def test_similarity_undoes_one() -> None:
+def test_similarity_undoes_one():
     truth = drive()
     moved = se3.Similarity(
         0.2, se3.from_rotation_vector(np.array([0.3, -1.0, 0.2]), np.zeros(3))[:3, :3], np.ones(3)
@@ -206,7 +206,7 @@ def test_similarity_undoes_one() -> None:
     np.testing.assert_allclose(rigid.R_a_b, moved.R_a_b.T, atol=1e-9)
 
 
-def test_similarity_keeps_the_roll_of_a_straight_road() -> None:
+def test_similarity_keeps_the_roll_of_a_straight_road():
     """Positions on a line do not determine it; orientations do."""
     rng = np.random.default_rng(0)
     truth = np.tile(np.eye(4), (50, 1, 1))
@@ -218,7 +218,7 @@ def test_similarity_keeps_the_roll_of_a_straight_road() -> None:
     assert roll < np.deg2rad(0.3)
 
 
-def test_positions_of_a_long_drive_outweigh_a_constant_error_of_its_orientations() -> None:
+def test_positions_of_a_long_drive_outweigh_a_constant_error_of_its_orientations():
     truth = straight(200)
     tilted = truth.copy()
     tilted[:, :3, :3] = se3.from_rotation_vector(

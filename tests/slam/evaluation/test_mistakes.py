@@ -39,7 +39,7 @@ def said(estimate: Trajectory, reference: Trajectory) -> list[str]:
     return likely_mistakes(estimate, reference, associate(estimate, reference))
 
 
-def test_nothing_is_said_of_noise() -> None:
+def test_nothing_is_said_of_noise():
     truth = drive(noise_m=0.0)
     for noise_m in (0.0, 0.03, 1.0, 20.0):
         assert said(drive(noise_m=noise_m), truth) == []
@@ -56,13 +56,13 @@ def test_nothing_is_said_of_noise() -> None:
 
 
 @pytest.mark.parametrize("late_s", [3.0, -7.3, 0.4])
-def test_another_clock(late_s: float) -> None:
+def test_another_clock(late_s: float):
     truth = drive(noise_m=0.0)
     (line,) = said(changed(truth, drive().T_world_camera, late_s), truth)
     assert f"{-late_s:+.2f} s" in line and "times better (0.0" in line
 
 
-def test_a_clock_that_runs_faster_and_frame_numbers_that_are_late() -> None:
+def test_a_clock_that_runs_faster_and_frame_numbers_that_are_late():
     truth = drive(noise_m=0.0)
     (line,) = said(Trajectory(truth.stamps * 1.2, drive().T_world_camera), truth)
     assert "run faster" in line
@@ -88,7 +88,7 @@ def test_a_clock_that_runs_faster_and_frame_numbers_that_are_late() -> None:
         ),
     ],
 )
-def test_what_was_done_is_named(mistake, words: str) -> None:
+def test_what_was_done_is_named(mistake, words: str):
     truth = drive(noise_m=0.0)
     (line,) = said(changed(truth, mistake(drive().T_world_camera)), truth)
     assert words in line
@@ -97,7 +97,7 @@ def test_what_was_done_is_named(mistake, words: str) -> None:
         assert words in line
 
 
-def test_quaternions_in_another_order() -> None:
+def test_quaternions_in_another_order():
     truth = drive(noise_m=0.0)
     xyzw = Rotation.from_matrix(truth.T_world_camera[:, :3, :3]).as_quat()
     R = Rotation.from_quat(xyzw[:, [3, 0, 1, 2]]).as_matrix()  # w x y z, read as x y z w
@@ -105,7 +105,7 @@ def test_quaternions_in_another_order() -> None:
     assert "w x y z" in line
 
 
-def test_a_sparse_reference_is_compared_at_its_own_times() -> None:
+def test_a_sparse_reference_is_compared_at_its_own_times():
     estimate, truth = drive(), drive(29, noise_m=0.0, start_s=0.33, rate_hz=1.0)
     ours, theirs = associate(estimate, truth)
     assert len(ours) == len(theirs) == 29
@@ -113,7 +113,7 @@ def test_a_sparse_reference_is_compared_at_its_own_times() -> None:
     assert said(estimate, truth) == []
 
 
-def test_the_gain_of_an_exact_fit_is_bounded() -> None:
+def test_the_gain_of_an_exact_fit_is_bounded():
     truth = drive()
     (line,) = said(changed(truth, truth.T_world_camera[::-1]), truth)
     assert "fits 1000 times better" in line

@@ -37,9 +37,7 @@ def moved(trajectory: Trajectory, scale: float) -> Trajectory:
     return Trajectory(trajectory.stamps, similarity.apply_to_poses(trajectory.T_world_camera))
 
 
-def test_alignment_removes_a_similarity_and_drift_is_then_zero(
-    make_run: Callable[..., RunFolder],
-) -> None:
+def test_alignment_removes_a_similarity_and_drift_is_then_zero(make_run: Callable[..., RunFolder]):
     reference = make_run().trajectory("reference")
     fitted = aligned({"reference": reference, "optimised": moved(reference, 0.2)})["optimised"]
     np.testing.assert_allclose(fitted.positions, reference.positions, atol=1e-5)
@@ -48,7 +46,7 @@ def test_alignment_removes_a_similarity_and_drift_is_then_zero(
     assert max(errors.max() for _, *both in segments for errors in both) < 1e-4
 
 
-def test_drift_of_a_known_scale_and_rotation_has_its_hand_value() -> None:
+def test_drift_of_a_known_scale_and_rotation_has_its_hand_value():
     ((_, translation_m, rotation),) = segment_errors(line(121, 1.05), line(121), [10.0])
     # a segment ends with the first frame beyond its length, KITTI's rule: 11 m for 10 m
     assert translation_m == pytest.approx(0.05 * 11)
@@ -102,7 +100,7 @@ def metrics_of(*given: Any, **named: Any) -> dict[str, Any]:
     return trajectory_metrics(*given, **named).tree()
 
 
-def test_a_known_similarity_under_each_alignment() -> None:
+def test_a_known_similarity_under_each_alignment():
     """The estimate is the truth, 2.5 times too small, from a world that is rotated and moved."""
     truth = drive()
     turn, move = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(), np.array([5.0, -6.0, 7.0])
@@ -129,7 +127,7 @@ def test_a_known_similarity_under_each_alignment() -> None:
     assert metrics["evo"]["difference"] < 1e-6
 
 
-def test_a_noisy_estimate_agrees_with_evo() -> None:
+def test_a_noisy_estimate_agrees_with_evo():
     rng = np.random.default_rng(7)
     noise = se3.from_rotation_vector(
         rng.normal(scale=0.02, size=(400, 3)), rng.normal(scale=0.5, size=(400, 3))
@@ -148,7 +146,7 @@ def test_a_noisy_estimate_agrees_with_evo() -> None:
     assert metrics["align"]["6dof"]["rpe_trans_rmse_m"] == pytest.approx(rmse, rel=1e-9)
 
 
-def test_hand_values_of_segments_and_steps() -> None:
+def test_hand_values_of_segments_and_steps():
     """A straight line whose estimate is 2 % long and turns 0.001 rad a metre about its own axis of motion."""
     truth, estimate = line(251), line(251, 1.02)
     estimate[:, :3, :3] = Rotation.from_rotvec(
@@ -164,7 +162,7 @@ def test_hand_values_of_segments_and_steps() -> None:
 
 
 @pytest.mark.parametrize(("frames", "fits"), [(100, False), (101, False), (103, True)])
-def test_short_paths_have_no_segments(frames: int, fits: bool) -> None:
+def test_short_paths_have_no_segments(frames: int, fits: bool):
     record = metrics_of(trajectory(line(frames)), trajectory(line(frames)))["align"]["none"]
     assert (record["t_rel_percent"] is not None) == fits
     if not fits:
@@ -175,7 +173,7 @@ def test_short_paths_have_no_segments(frames: int, fits: bool) -> None:
         assert record["r_rel_deg_per_100m"] is None
 
 
-def test_without_a_reference_every_number_has_a_reason() -> None:
+def test_without_a_reference_every_number_has_a_reason():
     metrics = metrics_of(trajectory(drive(10)), None)
     check_shape(metrics)
     assert metrics["snippet5"]["count_reason"] == "there is no reference trajectory"
@@ -190,7 +188,7 @@ def test_without_a_reference_every_number_has_a_reason() -> None:
     }
 
 
-def test_an_estimate_that_stands_still_has_no_scale() -> None:
+def test_an_estimate_that_stands_still_has_no_scale():
     metrics = metrics_of(trajectory(np.tile(drive(3)[2], (300, 1, 1))), trajectory(drive(300)))
     check_shape(metrics)
     for name in ("scale", "7dof"):
@@ -201,7 +199,7 @@ def test_an_estimate_that_stands_still_has_no_scale() -> None:
     assert "evo fails" in metrics["evo"]["difference_reason"]
 
 
-def test_a_reference_that_stands_still_cannot_be_scaled_to() -> None:
+def test_a_reference_that_stands_still_cannot_be_scaled_to():
     metrics = metrics_of(trajectory(drive(20)), trajectory(np.tile(np.eye(4), (20, 1, 1))))
     check_shape(metrics)
     errors = ate(metrics)
@@ -221,7 +219,7 @@ def test_a_reference_that_stands_still_cannot_be_scaled_to() -> None:
     assert direct["snippet5"]["ate_mean"] is None and direct["snippet5"]["re_mean"] == 0.3
 
 
-def test_a_camera_that_turns_on_the_spot_has_errors_of_rotation() -> None:
+def test_a_camera_that_turns_on_the_spot_has_errors_of_rotation():
     turning = np.tile(np.eye(4), (20, 1, 1))
     turning[:, :3, :3] = Rotation.from_rotvec(
         np.outer(np.deg2rad(np.arange(20)), [0, 1, 0])
@@ -231,7 +229,7 @@ def test_a_camera_that_turns_on_the_spot_has_errors_of_rotation() -> None:
 
 
 @pytest.mark.parametrize("unturned", ["reference", "estimate"])
-def test_without_rotations_only_positions_are_compared(unturned: str) -> None:
+def test_without_rotations_only_positions_are_compared(unturned: str):
     pair = {"reference": drive(), "estimate": drive()}
     pair[unturned][:, :3, :3] = np.eye(3)
     metrics = metrics_of(trajectory(pair["estimate"]), trajectory(pair["reference"]))
@@ -244,7 +242,7 @@ def test_without_rotations_only_positions_are_compared(unturned: str) -> None:
     assert metrics["snippet5"]["re_mean"] is None
 
 
-def test_a_straight_line_is_measured_though_evo_fails() -> None:
+def test_a_straight_line_is_measured_though_evo_fails():
     metrics = metrics_of(trajectory(line(120, 0.5)), trajectory(line(120)))
     check_shape(metrics)
     assert metrics["align"]["7dof"]["scale"] == pytest.approx(2.0)
@@ -254,7 +252,7 @@ def test_a_straight_line_is_measured_though_evo_fails() -> None:
 
 
 @pytest.mark.parametrize(("frames", "known"), [(1, set()), (2, {"none", "first"})])
-def test_one_and_two_frames(frames: int, known: set[str]) -> None:
+def test_one_and_two_frames(frames: int, known: set[str]):
     metrics = metrics_of(trajectory(line(frames)), trajectory(line(frames, 2.0)))
     check_shape(metrics)
     assert {name for name, value in ate(metrics).items() if value is not None} == known
@@ -277,13 +275,13 @@ def test_one_and_two_frames(frames: int, known: set[str]) -> None:
 )
 def test_what_has_no_error_has_a_reason(
     estimate: FloatArray, truth: FloatArray, alignment: str, reason: str
-) -> None:
+):
     metrics = metrics_of(trajectory(estimate), trajectory(truth))
     check_shape(metrics)
     assert reason in metrics["align"][alignment]["ate_rmse_m_reason"]
 
 
-def test_limits() -> None:
+def test_limits():
     rough = drive(60)
     rough[::2, 1, 3] += 0.2
     metrics = trajectory_metrics(trajectory(rough), trajectory(drive(60)))
@@ -317,9 +315,7 @@ PUBLISHED = ("ate_rmse_m", "t_rel_percent", "r_rel_deg_per_100m", "rpe_trans_m",
         ("10", [3.721, 2.293, 0.369, 0.047, 0.043], [3.356, 2.221, 0.369, 0.047, 0.043]),
     ],
 )
-def test_golden_numbers(
-    data_root: Path, sequence: str, six: list[float], seven: list[float]
-) -> None:
+def test_golden_numbers(data_root: Path, sequence: str, six: list[float], seven: list[float]):
     """DF-VO's stereo-trained trajectories, as kitti-odom-eval scores them, to every printed digit."""
     files = (
         data_root / "golden" / f"{kind}_{sequence}.txt" for kind in ("dfvo_stereo", "reference")

@@ -63,7 +63,7 @@ def binary_rows(folder: Path) -> list[list[list[float | str]]]:
     return found
 
 
-def test_a_model_reads_back(tmp_path: Path) -> None:
+def test_a_model_reads_back(tmp_path: Path):
     pixels = np.array([[10.0, 20.0], [11.0, 21.0], [12.0, 22.0]])
     seen = Sightings(np.array([3, 0, 3]), pixels, np.array([1, 1, 0]), np.array([0.25, 0.75, 1.0]))
     write_colmap(tmp_path / "new" / "model", CAMERA, drive(), POINTS, COLOURS, seen)

@@ -15,7 +15,7 @@ POINTS = np.array([[0.0, 0.5, 1.0], [1.25, -2.0, 3.0]])
 COLOURS = np.array([[0, 128, 255], [10, 20, 30]], np.uint8)
 
 
-def test_what_open3d_writes(tmp_path: Path) -> None:
+def test_what_open3d_writes(tmp_path: Path):
     o3d = import_open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(POINTS))
     cloud.normals = o3d.utility.Vector3dVector(np.tile([0.0, 1.0, 0.0], (2, 1)))
@@ -33,7 +33,7 @@ NORMALS = np.tile([0.0, 0.6, 0.8], (2, 1))
 @pytest.mark.parametrize("triangles", [None, TRIANGLES])
 def test_what_is_written_reads_back_here_and_in_open3d(
     tmp_path: Path, triangles: np.ndarray | None
-) -> None:
+):
     path = tmp_path / "c.ply"
     write_ply(path, coloured_ply(POINTS, NORMALS, COLOURS / 255, triangles))
     ply = read_ply(path)

@@ -21,9 +21,7 @@ from slam.formats.trajectory import read_trajectory
         *("0.1 1 2 3 0 0 0 1", "0.25 1 two 3 0 0 0 1", "1 0 0 1.5 0 1 0 2.5 0 0 1 3.5"),
     ],
 )
-def test_a_bad_row_costs_itself_alone(
-    tmp_path: Path, bad: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_bad_row_costs_itself_alone(tmp_path: Path, bad: str, caplog: pytest.LogCaptureFixture):
     rows = [f"{0.1 * k:.1f} {k} 0 0 0 0 0 1" for k in range(6)]
     path = tmp_path / "poses.txt"
     path.write_text("\n".join([*rows[:3], bad, *rows[3:], "0.9 1"]))
@@ -36,7 +34,7 @@ def test_a_bad_row_costs_itself_alone(
 @pytest.mark.parametrize(
     ("unit", "form"), [(1, "{:.6f}"), (10**3, "{:.0f}"), (10**6, "{:.0f}"), (10**9, "{:.0f}")]
 )
-def test_tables_of_others(tmp_path: Path, separator: str, unit: int, form: str) -> None:
+def test_tables_of_others(tmp_path: Path, separator: str, unit: int, form: str):
     """Another separator, and stamps since 1970 in another unit, rows in no order."""
     stamps = [1403715273.5, 1403715273.25, 1403715274.0, 1403715273.0]
     w_last = unit != 10**9 or separator == "\t"  # separated nanoseconds are EuRoC's, with w x y z

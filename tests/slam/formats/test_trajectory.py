@@ -35,7 +35,7 @@ def written(tmp_path: Path, text: str) -> Path:
     return path
 
 
-def test_length_and_rebasing() -> None:
+def test_length_and_rebasing():
     places = np.array([[1.0, 1.0, 1.0], [1.0, 1.0, 4.0], [1.0, 5.0, 4.0]])
     turn = Rotation.from_rotvec([0.0, np.pi / 2, 0.0]).as_matrix()
     trajectory = Trajectory(np.array([0.0, 1.0, 2.0]), se3.make(np.tile(turn, (3, 1, 1)), places))
@@ -48,7 +48,7 @@ def test_length_and_rebasing() -> None:
 
 
 @pytest.mark.parametrize("format", ["auto", "kitti"])
-def test_kitti_round_trip(tmp_path: Path, format: str) -> None:
+def test_kitti_round_trip(tmp_path: Path, format: str):
     trajectory = wander(7)
     write_kitti(tmp_path / "new" / "poses.txt", trajectory)
     back = read_trajectory(tmp_path / "new" / "poses.txt", format)
@@ -58,7 +58,7 @@ def test_kitti_round_trip(tmp_path: Path, format: str) -> None:
 
 
 @pytest.mark.parametrize("format", ["auto", "tum"])
-def test_tum_round_trip_keeps_every_digit_of_a_stamp(tmp_path: Path, format: str) -> None:
+def test_tum_round_trip_keeps_every_digit_of_a_stamp(tmp_path: Path, format: str):
     trajectory = wander(7)
     stamps = 1311868164.3631 + 0.1037 * np.arange(7, dtype=np.float64)
     write_tum(tmp_path / "poses.txt", Trajectory(stamps, trajectory.T_world_camera))
@@ -96,13 +96,13 @@ def test_tum_round_trip_keeps_every_digit_of_a_stamp(tmp_path: Path, format: str
         (TUM, "euroc", "unknown trajectory format 'euroc'"),
     ],
 )
-def test_what_is_wrong_is_one_line(tmp_path: Path, text: str, format: str, words: str) -> None:
+def test_what_is_wrong_is_one_line(tmp_path: Path, text: str, format: str, words: str):
     with pytest.raises(TrajectoryError, match=words.replace("(", r"\(")) as error:
         read_trajectory(written(tmp_path, text), format)
     assert "\n" not in str(error.value)
 
 
-def test_rows_without_stamps_keep_their_places_where_others_are_bad(tmp_path: Path) -> None:
+def test_rows_without_stamps_keep_their_places_where_others_are_bad(tmp_path: Path):
     truth = wander(10)
     write_kitti(tmp_path / "truth.txt", truth)
     rows = (tmp_path / "truth.txt").read_text().splitlines()
@@ -117,7 +117,7 @@ def test_rows_without_stamps_keep_their_places_where_others_are_bad(tmp_path: Pa
 
 
 @pytest.mark.parametrize("numbered", [False, True])
-def test_rows_of_whole_matrices(tmp_path: Path, numbered: bool) -> None:
+def test_rows_of_whole_matrices(tmp_path: Path, numbered: bool):
     trajectory = wander(4)
     rows = trajectory.T_world_camera.reshape(4, 16)
     np.savetxt(
@@ -129,7 +129,7 @@ def test_rows_of_whole_matrices(tmp_path: Path, numbered: bool) -> None:
 
 
 @pytest.mark.parametrize("header", ["#timestamp,p_RS_R_x [m]", "timestamp,x,y,z,qw,qx,qy,qz"])
-def test_the_true_poses_of_euroc(tmp_path: Path, header: str) -> None:
+def test_the_true_poses_of_euroc(tmp_path: Path, header: str):
     row = "14037152{}3262142976,1.5,2.5,3.5,0.6,0.8,0,0,9,9,9,9,9,9,9,9,9"
     read = read_trajectory(written(tmp_path, "\n".join([header, row.format(7), row.format(8)])))
     assert read.timed and read.stamps[0] == 1403715273.262142976
@@ -142,11 +142,11 @@ def test_the_true_poses_of_euroc(tmp_path: Path, header: str) -> None:
 @pytest.mark.parametrize(
     "row", ["1.0003 0 0 0 0 0.9998 0.0002 0 0 0 1 0", "0 0 0 0 0 0 0.7071 0.7071"]
 )
-def test_rounded_rotations_are_repaired(tmp_path: Path, row: str) -> None:
+def test_rounded_rotations_are_repaired(tmp_path: Path, row: str):
     assert se3.is_se3(read_trajectory(written(tmp_path, row)).T_world_camera, tolerance=1e-12)
 
 
-def test_untimed_trajectories_match_row_by_row() -> None:
+def test_untimed_trajectories_match_row_by_row():
     timed = wander(4)
     untimed = Trajectory(10 * timed.stamps, timed.T_world_camera, timed=False)
     assert associate(untimed, timed) == (untimed, timed)
@@ -155,7 +155,7 @@ def test_untimed_trajectories_match_row_by_row() -> None:
     assert "\n" not in str(error.value)
 
 
-def test_rows_with_frame_numbers_match_the_rows_of_the_reference(tmp_path: Path) -> None:
+def test_rows_with_frame_numbers_match_the_rows_of_the_reference(tmp_path: Path):
     rows = "".join(f"{k} 1 0 0 {k} 0 1 0 0 0 0 1 0\n" for k in (2, 3, 7))
     estimate = read_trajectory(written(tmp_path, rows))
     assert estimate.numbered and not estimate.timed
@@ -171,7 +171,7 @@ def test_rows_with_frame_numbers_match_the_rows_of_the_reference(tmp_path: Path)
         read_trajectory(written(tmp_path, rows + rows))
 
 
-def test_frames_cut_the_reference_and_a_file_of_as_many_rows_is_of_these_frames() -> None:
+def test_frames_cut_the_reference_and_a_file_of_as_many_rows_is_of_these_frames():
     reference = Trajectory(np.arange(10.0), wander(10).T_world_camera, timed=False)
     for estimate in (reference, reference.select(np.arange(4, 8))):
         ours, truth = associate(estimate, reference, (4, 8))
@@ -179,7 +179,7 @@ def test_frames_cut_the_reference_and_a_file_of_as_many_rows_is_of_these_frames(
         np.testing.assert_array_equal(truth.T_world_camera, reference.T_world_camera[4:8])
 
 
-def test_seven_columns_are_a_camera_that_looks_along_x(tmp_path: Path) -> None:
+def test_seven_columns_are_a_camera_that_looks_along_x(tmp_path: Path):
     """TartanVO's: ahead, right and down are x, y and z; a turn to the right is about its z."""
     half = np.sin(np.pi / 4)
     poses = read_trajectory(
@@ -189,7 +189,7 @@ def test_seven_columns_are_a_camera_that_looks_along_x(tmp_path: Path) -> None:
     np.testing.assert_allclose(poses[1, :3, :3] @ [0, 0, 1], [1, 0, 0], atol=1e-12)
 
 
-def test_stamps_match_one_to_one_within_half_a_period() -> None:
+def test_stamps_match_one_to_one_within_half_a_period():
     reference = wander(50)
     stamps = reference.stamps[10:40:2] + 0.03
     estimate, matched = associate(Trajectory(stamps, reference.T_world_camera[10:40:2]), reference)

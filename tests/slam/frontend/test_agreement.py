@@ -47,7 +47,7 @@ def noisy(T: np.ndarray) -> np.ndarray:
 )
 def test_lidar_is_compared_with_the_steps_of_the_images(
     made: Callable[[np.ndarray], np.ndarray], least: float
-) -> None:
+):
     motions = {
         (k, k + 1): Motion(
             RelativePose(k, k + 1, T, np.full(6, 0.01), "essential"), 1e-4 * np.eye(6)
@@ -72,12 +72,12 @@ def test_lidar_is_compared_with_the_steps_of_the_images(
 )
 def test_lengths_are_compared_with_the_camera_height(
     implied: float, stated: float | None, is_wrong: bool
-) -> None:
+):
     found = agreement.of_height("scale.mode=known", implied, stated, 0.02)
     assert found.is_wrong == is_wrong and (is_wrong or found.sigmas < agreement.DOUBTFUL)
 
 
-def test_disparity_that_is_read_as_depth_is_doubtful() -> None:
+def test_disparity_that_is_read_as_depth_is_doubtful():
     true = np.exp(np.random.default_rng(0).uniform(np.log(4), np.log(40), 400))
     right, inverse = (
         DepthError().with_step(learned, 1 / true, 0.0 * true, 1.0) for learned in (true, 40 / true)
@@ -141,9 +141,7 @@ def driven(
     ],
     ids=str,
 )
-def test_a_drive_whose_images_are_unlike_those_of_good_drives_is_doubtful(
-    doubtful: dict[str, Any],
-) -> None:
+def test_a_drive_whose_images_are_unlike_those_of_good_drives_is_doubtful(doubtful: dict[str, Any]):
     assert driven(**doubtful) < 0.5 < 0.9 < driven(weak=8)
 
 
@@ -153,7 +151,7 @@ def found(ratio: float, sigma: float = 0.03) -> FoundCamera:
     return FoundCamera(focal, (0.0, 0.0), (0.0, 0.0), sigma, 6, 60.0)
 
 
-def test_a_stated_focal_length_is_contradicted_beyond_three_sigmas_alone() -> None:
+def test_a_stated_focal_length_is_contradicted_beyond_three_sigmas_alone():
     said = agreement.of_focal_length(found(1.15), CAMERA)
     assert said is not None and said.sigmas > 3.0
     assert "276 px" in said.figure and "try --camera auto" in said.figure
@@ -164,7 +162,7 @@ def test_a_stated_focal_length_is_contradicted_beyond_three_sigmas_alone() -> No
 
 
 @pytest.mark.parametrize(("sigma", "most"), [(0.03, 0.75), (0.06, 0.43), (0.35, 0.08)])
-def test_an_uncertain_focal_length_stretches_the_road(sigma: float, most: float) -> None:
+def test_an_uncertain_focal_length_stretches_the_road(sigma: float, most: float):
     sure = agreement.confidence([], is_metric=True, is_carried=False, focal_sigma=sigma)
     assert sure == pytest.approx(most, abs=0.02)
 
@@ -172,19 +170,17 @@ def test_an_uncertain_focal_length_stretches_the_road(sigma: float, most: float)
 @pytest.mark.parametrize(("is_metric", "is_carried"), [(False, False), (True, True)])
 def test_without_metres_and_of_a_carried_camera_no_number_is_said(
     is_metric: bool, is_carried: bool
-) -> None:
+):
     assert isinstance(agreement.confidence([], is_metric, is_carried), Failed)
 
 
 @pytest.mark.parametrize(("sigmas", "drift"), [(3.5, 0.0), (0.0, 0.035)])
-def test_a_shape_is_doubtful_by_contradictions_and_by_its_drift(
-    sigmas: float, drift: float
-) -> None:
+def test_a_shape_is_doubtful_by_contradictions_and_by_its_drift(sigmas: float, drift: float):
     said = [agreement.Agreement("gaps", sigmas, "")]
     assert agreement.shape_confidence(said, drift) < 0.5 < agreement.shape_confidence([], 0.01)
 
 
-def test_noise_of_creeping_steps_does_not_point_aside() -> None:
+def test_noise_of_creeping_steps_does_not_point_aside():
     poses = np.tile(np.eye(4), (600, 1, 1))
     poses[:, 0, 3] = np.random.default_rng(0).normal(0.0, 0.005, 600)
     poses[:, 2, 3] = 0.01 * np.arange(600)
@@ -193,7 +189,7 @@ def test_noise_of_creeping_steps_does_not_point_aside() -> None:
 
 def test_two_contradictions_are_two_warnings(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+):
     monkeypatch.setattr(logging.getLogger(), "handlers", [])
     Terminal(logging.WARNING)
     for each in (
@@ -204,6 +200,6 @@ def test_two_contradictions_are_two_warnings(
     assert "lidar contradicts" in (said := capsys.readouterr().err) and "GPS contradicts" in said
 
 
-def test_a_frame_without_a_motion_has_no_support() -> None:
+def test_a_frame_without_a_motion_has_no_support():
     motions = [Motion(RelativePose(0, 1, STEPS[0], np.full(6, 0.01), "essential"), support=0.7)]
     assert frame_support(range(3), motions).tolist() == [0.7, 0.7, 0.0]

@@ -7,7 +7,7 @@ from slam.frontend.drive import Segment, find_cuts, find_segments
 STEPS = [(k, k + 1) for k in range(9)]
 
 
-def test_a_single_failed_step_between_measured_ones_is_a_cut() -> None:
+def test_a_single_failed_step_between_measured_ones_is_a_cut():
     measured = [ends for ends in STEPS if ends != (4, 5)]
     assert find_cuts({(4, 5): 0.02}, measured, ()) == [5]
     assert find_cuts({(4, 5): 0.02}, measured, {5}) == [], "the image is unusable"
@@ -17,7 +17,7 @@ def test_a_single_failed_step_between_measured_ones_is_a_cut() -> None:
     assert find_cuts({(4, 5): 0.5}, measured, ()) == [], "half of the image is another car"
 
 
-def test_segments_begin_at_cuts_and_after_long_gaps_that_no_map_of_keyframes_relates() -> None:
+def test_segments_begin_at_cuts_and_after_long_gaps_that_no_map_of_keyframes_relates():
     def never(_: int) -> bool:
         return False
 

@@ -53,7 +53,7 @@ def scale(lengths: Mapping[Ends, float] | None = None) -> Scale:
 STEPS = [(0, 1), (1, 2), (2, 5), (5, 6), (6, 7), (8, 9)]
 
 
-def test_every_measurement_becomes_a_factor_in_the_unit_of_the_scale() -> None:
+def test_every_measurement_becomes_a_factor_in_the_unit_of_the_scale():
     small = drive(1.0 / METRES)
     interpolated = [pose(7, 8, "interpolated", small)]
     drawn = Drive(
@@ -70,7 +70,7 @@ def test_every_measurement_becomes_a_factor_in_the_unit_of_the_scale() -> None:
     np.testing.assert_allclose(sigmas["interpolated"][3:], METRES * 0.01)
 
 
-def test_a_step_takes_its_own_length_also_where_it_skips_frames() -> None:
+def test_a_step_takes_its_own_length_also_where_it_skips_frames():
     """Learned depth makes every step three times too long; a step of one frame and one of three have own lengths."""
     wrong = drive(3.0 / METRES)
     lengths = {
@@ -114,7 +114,7 @@ def by_network() -> list[RelativePose]:
 T_OF_NETWORK = from_rotation_vector(np.array([0.0, -0.1, 0.0]), np.array([0.0, 0.0, 0.5 * METRES]))
 
 
-def test_odometry_chains_steps_that_skip_frames() -> None:
+def test_odometry_chains_steps_that_skip_frames():
     """Frames 3 and 4 lie inside of a step and are chained by the network; frame 5 is chained to frame 2."""
     T = chain_odometry([*(pose(*ends) for ends in STEPS), *by_network()], FRAMES)
     for k in (0, 1, 2, 5, 6, 7):
@@ -126,13 +126,13 @@ def test_odometry_chains_steps_that_skip_frames() -> None:
     np.testing.assert_allclose(T[11], T[9] @ T_OF_NETWORK @ T_OF_NETWORK, atol=1e-9)
 
 
-def test_odometry_takes_the_step_from_the_nearest_frame_and_the_last_of_these() -> None:
+def test_odometry_takes_the_step_from_the_nearest_frame_and_the_last_of_these():
     wrong = drive(3.0)
     mixed = [pose(0, 2, T=wrong), pose(1, 2, T=wrong), pose(1, 2), pose(0, 1), pose(0, 2, T=wrong)]
     np.testing.assert_allclose(chain_odometry(mixed, 3)[2], TRUE[2], atol=1e-9)
 
 
-def test_odometry_takes_lidar_before_a_guess_and_images_before_lidar() -> None:
+def test_odometry_takes_lidar_before_a_guess_and_images_before_lidar():
     wrong = drive(3.0)
     guess, scan = pose(0, 1, INTERPOLATED_SOURCE, wrong), pose(0, 1, LIDAR_SOURCE)
     np.testing.assert_allclose(chain_odometry([scan, guess], 2)[1], TRUE[1], atol=1e-9)
@@ -147,7 +147,7 @@ def relative(
     return RelativePose(first, last, T, np.full(6, sigma), source)
 
 
-def test_a_long_gap_ends_where_the_map_says() -> None:
+def test_a_long_gap_ends_where_the_map_says():
     """The camera was carried 2 m aside during 30 blank frames; constant velocity knows nothing of that."""
     count, before, after = 60, 20, 51
     centres = np.column_stack([0.01 * np.arange(count), np.zeros(count), np.zeros(count)])
@@ -171,7 +171,7 @@ def test_a_long_gap_ends_where_the_map_says() -> None:
     np.testing.assert_allclose(graph.optimise(start)[mapped], truth[mapped], atol=1e-6)
 
 
-def test_a_gap_between_two_maps_stays_a_guess() -> None:
+def test_a_gap_between_two_maps_stays_a_guess():
     guess = RelativePose(1, 2, np.eye(4), np.ones(6), INTERPOLATED_SOURCE)
     truth = from_rotation_vector(np.zeros((4, 3)), np.arange(12.0).reshape(4, 3))
     by_map = [

@@ -58,17 +58,17 @@ def found_in(images: list[Grey], given: Mask | None = None) -> Mask:
     return resized_mask(none if fixed.mask is None else fixed.mask, WIDTH, HEIGHT)
 
 
-def test_a_street_alone_has_hardly_anything_fixed() -> None:
+def test_a_street_alone_has_hardly_anything_fixed():
     assert found_in(street()).mean() < 0.02
 
 
-def test_a_bonnet_that_reflects_the_scene_is_found_and_the_road_before_it_stays() -> None:
+def test_a_bonnet_that_reflects_the_scene_is_found_and_the_road_before_it_stays():
     found = found_in([with_bonnet(image) for image in street()])
     assert found[-BONNET + 2 :].mean() > 0.97
     assert found[: -BONNET - 8].mean() < 0.02
 
 
-def test_a_caption_is_found_though_its_digits_change() -> None:
+def test_a_caption_is_found_though_its_digits_change():
     given = np.zeros((HEIGHT, WIDTH), np.bool_)
     given[-8:] = True
     found = found_in([with_caption(image, k) for k, image in enumerate(street())], given)
@@ -76,7 +76,7 @@ def test_a_caption_is_found_though_its_digits_change() -> None:
     assert found[32:-8].mean() < 0.02
 
 
-def test_the_frame_of_a_mirror_is_found_and_the_world_around_it_stays() -> None:
+def test_the_frame_of_a_mirror_is_found_and_the_world_around_it_stays():
     found = found_in([with_mirror(image, k) for k, image in enumerate(street())])
     frame = np.zeros((HEIGHT, WIDTH), np.uint8)
     cv2.rectangle(frame, (385, 3), (508, 45), 1, 5)
@@ -86,7 +86,7 @@ def test_the_frame_of_a_mirror_is_found_and_the_world_around_it_stays() -> None:
 
 
 @pytest.mark.parametrize("passes", [False, True])
-def test_a_camera_that_stands_learns_nothing(passes: bool) -> None:
+def test_a_camera_that_stands_learns_nothing(passes: bool):
     """With noise, and with a lorry all of texture that passes over less than half of the image."""
     rng = np.random.default_rng(SEED)
     lorry = cv2.resize(rng.integers(0, 255, (20, 40)).astype(np.uint8), (280, 150))
@@ -102,7 +102,7 @@ def test_a_camera_that_stands_learns_nothing(passes: bool) -> None:
     assert not found_in(images).any()
 
 
-def test_another_size_begins_anew() -> None:
+def test_another_size_begins_anew():
     fixed = FixedMask()
     for image in street():
         fixed.look_at(with_bonnet(image))
@@ -114,7 +114,7 @@ def test_another_size_begins_anew() -> None:
 @pytest.mark.parametrize(("rows", "said"), [(0, 0), (10, 1), (70, 2)])
 def test_a_mask_that_leaves_little_of_the_world_is_said(
     rows: int, said: int, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     fixed = np.zeros((100, 10), bool)
     fixed[:rows] = True
     warn_of_fixed(fixed)

@@ -62,14 +62,14 @@ def steps(count: int, scatter: float, seconds: float = 0.1) -> Measured:
 )
 def test_a_vehicle_goes_the_same_way_for_a_while_and_fast(
     count: int, scatter: float, seconds: float, front_end: FrontEnd | None
-) -> None:
+):
     drive = steps(count, scatter, seconds)
     assert choose(KeyframesConfig(), None, drive) is front_end
     drive.roads[:] = [Failed("no road")] * count
     assert choose(KeyframesConfig(), None, drive) is not FrontEnd.STEPS
 
 
-def test_a_known_camera_height_and_a_setting_choose() -> None:
+def test_a_known_camera_height_and_a_setting_choose():
     by_hand = steps(60, 1.0)
     assert choose(KeyframesConfig(), 1.65, by_hand) is FrontEnd.STEPS
     assert choose(KeyframesConfig(use="never"), None, by_hand) is FrontEnd.STEPS
@@ -82,7 +82,7 @@ def completed(observer: Observer) -> Drive:
 
 
 @pytest.mark.parametrize("stands", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_steps_are_measured_where_keyframes_have_no_pose(stands: bool) -> None:
+def test_steps_are_measured_where_keyframes_have_no_pose(stands: bool):
     """Before their map begins and over a gap, not beside repeated images: the map tells whether the camera stood."""
     truth, blank, repeated = room.walk(40), (24, 25), (32, 33)
     if stands:
@@ -109,7 +109,7 @@ def test_steps_are_measured_where_keyframes_have_no_pose(stands: bool) -> None:
     "interrupted",
     [(20, 22), *(pytest.param(frames, marks=pytest.mark.slow) for frames in ((), (19, 21)))],
 )
-def test_depth_is_predicted_for_keyframes_alone(interrupted: tuple[int, ...]) -> None:
+def test_depth_is_predicted_for_keyframes_alone(interrupted: tuple[int, ...]):
     """The same ones where the observations are asked for in between."""
     truth = room.walk(40)
     predicted: list[int] = []
@@ -138,7 +138,7 @@ def test_depth_is_predicted_for_keyframes_alone(interrupted: tuple[int, ...]) ->
     assert len(drive.trusted[0].sources) == 4 and not drive.interpolated
 
 
-def test_observations_stay_while_frames_follow() -> None:
+def test_observations_stay_while_frames_follow():
     truth = room.walk(40)
     oracle = OraclePredictor(truth, lambda k: room.depth_map(truth[k]))
     with Observer(oracle, room.INTRINSICS, KEYFRAMES_ALONE, Stopwatch()) as observer:
@@ -152,7 +152,7 @@ def test_observations_stay_while_frames_follow() -> None:
     assert drive.maps and drive.events and pickle.dumps(drive) == before
 
 
-def test_what_keyframes_measured_stays_when_the_camera_is_lost() -> None:
+def test_what_keyframes_measured_stays_when_the_camera_is_lost():
     """Although the networks see another motion."""
     truth, blank = room.walk(40), range(27, 40)
     straight = chain(from_rotation_vector(np.zeros((39, 3)), np.tile([0.0, 0.0, 0.1], (39, 1))))
@@ -186,7 +186,7 @@ def tracked(truth: FloatArray, unseen: Sequence[int], sparse: Sequence[int] = ()
     return tracker.finish()
 
 
-def test_after_a_short_loss_the_camera_is_found_again_in_its_map() -> None:
+def test_after_a_short_loss_the_camera_is_found_again_in_its_map():
     walked = room.there_and_back(110, roll=0.4, closer=0.3)
     truth = np.concatenate([walked[:60], walked[82:]])
     measured = tracked(truth, range(60, 66))
@@ -223,7 +223,7 @@ def test_after_a_short_loss_the_camera_is_found_again_in_its_map() -> None:
 )
 def test_a_camera_that_is_lost_again_at_once_is_found_in_the_map_as_it_then_is(
     places: list[int], unseen: Sequence[int], sparse: Sequence[int], relocalised: list[int]
-) -> None:
+):
     truth = room.there_and_back(110, roll=0.4, closer=0.3)[places]
     events = tracked(truth, unseen, sparse).events
     assert [each.frame for each in events if each.event == "relocalised"] == relocalised

@@ -44,7 +44,7 @@ def collected(
     return Measured(snippets=snippets, motions=list(steps), roads=roads, **others)
 
 
-def test_a_drive_without_gaps_stays_as_it_was() -> None:
+def test_a_drive_without_gaps_stays_as_it_was():
     snippets, steps = snippets_of(steady()), [measured(steady(), 3, 4)]
     found = interpolate_gaps(collected(snippets, steps), 4)
     assert found.snippets == found.trusted == snippets and list(found.steps.values()) == steps
@@ -54,7 +54,7 @@ def test_a_drive_without_gaps_stays_as_it_was() -> None:
 @pytest.mark.parametrize(
     "gap", [{20}, set(range(15, 25)), {0}, {39}, {3, 20, 21}, {10, 12, 14, 16}]
 )
-def test_a_gap_of_a_steady_drive_is_interpolated_exactly(gap: set[int]) -> None:
+def test_a_gap_of_a_steady_drive_is_interpolated_exactly(gap: set[int]):
     found = closed(steady(), gap)
     assert set(found.interpolated) == gap and found.interpolated[min(gap)] == "black"
     np.testing.assert_allclose(chain_raw(found.snippets, COUNT), steady(), atol=1e-9)
@@ -68,7 +68,7 @@ def test_a_gap_of_a_steady_drive_is_interpolated_exactly(gap: set[int]) -> None:
     assert linked == set(range(COUNT - 1))
 
 
-def test_a_gap_beside_steps_of_the_network_alone_has_the_unit_of_learned_depth() -> None:
+def test_a_gap_beside_steps_of_the_network_alone_has_the_unit_of_learned_depth():
     """The network's lengths are three quarters of those by learned depth."""
     short = steady()
     short[:, :3, 3] *= 0.75
@@ -85,7 +85,7 @@ def test_a_gap_beside_steps_of_the_network_alone_has_the_unit_of_learned_depth()
     np.testing.assert_allclose(chain_raw(found.snippets, COUNT), short, atol=1e-9)
 
 
-def test_the_motion_changes_evenly_from_before_to_after() -> None:
+def test_the_motion_changes_evenly_from_before_to_after():
     lengths = np.r_[np.full(19, 1.0), np.full(20, 3.0)]
     drive = chain(
         from_rotation_vector(
@@ -97,7 +97,7 @@ def test_the_motion_changes_evenly_from_before_to_after() -> None:
     assert values == sorted(values) and 1.0 < values[0] < 1.5 and 2.5 < values[-1] < 3.0
 
 
-def test_a_step_over_a_gap_is_divided_into_equal_ones() -> None:
+def test_a_step_over_a_gap_is_divided_into_equal_ones():
     drive = steady()
     drive[25:] = (
         drive[14]
@@ -113,13 +113,13 @@ def test_a_step_over_a_gap_is_divided_into_equal_ones() -> None:
     assert found.steps[14, 25] is over_gap
 
 
-def test_steps_measured_by_image_geometry_are_not_interpolated() -> None:
+def test_steps_measured_by_image_geometry_are_not_interpolated():
     found = closed(steady(), {10, 12}, measured(steady(), 5, 6), measured(steady(), 8, 9))
     assert [f.from_index for f in found.gap_steps] == [9, 10, 11, 12]
     assert [f.from_index for f in closed(steady(), {2}).gap_steps] == [0, 1, 2]
 
 
-def test_a_step_that_skips_usable_frames_does_not_change_the_interpolation() -> None:
+def test_a_step_that_skips_usable_frames_does_not_change_the_interpolation():
     """A step from a keyframe beside those from frame to frame; its frames are measured by the network."""
     without, beside = closed(steady(), {20}), closed(steady(), {20}, measured(drifting(), 5, 11))
     assert [f.ends for f in beside.gap_steps] == [f.ends for f in without.gap_steps]
@@ -151,7 +151,7 @@ def repeating(frozen: bool) -> tuple[Filled, FloatArray]:
     ), true
 
 
-def test_repeated_images_of_a_moving_camera_are_interpolated() -> None:
+def test_repeated_images_of_a_moving_camera_are_interpolated():
     found, true = repeating(frozen=True)
     assert (
         set(found.interpolated) == set(range(15, 25)) and "stands still" in found.interpolated[15]
@@ -164,19 +164,19 @@ def test_repeated_images_of_a_moving_camera_are_interpolated() -> None:
     assert not any(set(range(15, 25)).intersection(ends) for ends in found.steps)
 
 
-def test_repeated_images_of_a_standing_camera_are_measurements() -> None:
+def test_repeated_images_of_a_standing_camera_are_measurements():
     found, _ = repeating(frozen=False)
     assert found.interpolated == {} and found.gap_steps == [] and len(found.trusted) == COUNT - 4
     assert len(found.steps) == COUNT - 1
 
 
-def test_repetition_to_the_end_is_standing_still() -> None:
+def test_repetition_to_the_end_is_standing_still():
     still = np.tile(np.eye(4), (COUNT, 1, 1))
     found = interpolate_gaps(collected(snippets_of(still), repeated=list(range(1, COUNT))), 4)
     assert found.interpolated == {} and found.gap_steps == []
 
 
-def test_without_any_snippet_there_is_one_error() -> None:
+def test_without_any_snippet_there_is_one_error():
     reasons = dict.fromkeys(range(3, COUNT, 4), "image 3 is truncated")
     with pytest.raises(
         SlamError, match="no 5 usable frames in a row among 40: image 3 is truncated"

@@ -59,27 +59,27 @@ def circles(radius_m: float, laps: int) -> FloatArray:
 @pytest.mark.parametrize(
     "walk", [straight(150.0), straight(300.0), circles(30.0, 2)], ids=["150 m", "300 m", "two laps"]
 )
-def test_errors_of_fixes_do_not_lengthen_the_scale(walk: FloatArray) -> None:
+def test_errors_of_fixes_do_not_lengthen_the_scale(walk: FloatArray):
     found = [scale(walk, seed) for seed in range(12)]
     values = [each.value for each in found if isinstance(each, ScaleEstimate)]
     assert len(values) == 12
     assert np.mean(values) == pytest.approx(1.0, abs=0.025)
 
 
-def test_a_track_under_the_documented_length_gives_no_scale() -> None:
+def test_a_track_under_the_documented_length_gives_no_scale():
     found = [scale(straight(112.0), seed) for seed in range(12)]
     assert all(isinstance(each, Failed) and "moves too little" in each.reason for each in found)
 
 
 @pytest.mark.parametrize("latitude", [-72.0, 0.0, 49.0, 89.9])
-def test_there_and_back(latitude: float) -> None:
+def test_there_and_back(latitude: float):
     frame = LocalFrame(np.array([latitude, 8.4, 115.0]))
     points = np.random.default_rng(0).normal(scale=[3e3, 3e3, 50.0], size=(50, 3))
     np.testing.assert_allclose(frame.points(frame.places(points)), points, atol=1e-6)
     np.testing.assert_allclose(frame.points(np.array([[latitude, 8.4, 115.0]])), 0.0, atol=1e-8)
 
 
-def test_a_minute_of_arc_has_its_length() -> None:
+def test_a_minute_of_arc_has_its_length():
     """At the equator a minute of longitude is a/3437.7 long; at the pole a minute of latitude a^2/b/3437.7."""
     minute = np.deg2rad(1 / 60)
     east = LocalFrame(np.array([0.0, 0.0, 0.0])).points(np.array([[0.0, 1 / 60, 0.0]]))[0]
@@ -94,7 +94,7 @@ def test_a_minute_of_arc_has_its_length() -> None:
     )
 
 
-def test_speeds_give_the_lengths_of_a_walk_too_short_for_fixes_without_heights() -> None:
+def test_speeds_give_the_lengths_of_a_walk_too_short_for_fixes_without_heights():
     positions = 0.5 * straight(100.0)
     stamps = np.arange(len(positions)) / HZ
     seconds = np.arange(0.0, stamps[-1])

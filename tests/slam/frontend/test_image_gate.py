@@ -71,12 +71,12 @@ def panned(positions_px: np.ndarray) -> list[Image]:
 
 
 @pytest.mark.parametrize("hazards", HAZARDS)
-def test_a_drive_passes(hazards: tuple[str, ...]) -> None:
+def test_a_drive_passes(hazards: tuple[str, ...]):
     assert set(verdicts(street(hazards))) == {"new"}
 
 
 @pytest.mark.parametrize("level", [0, 255, 90])
-def test_blank_images_with_a_little_noise_are_refused_and_the_drive_goes_on(level: int) -> None:
+def test_blank_images_with_a_little_noise_are_refused_and_the_drive_goes_on(level: int):
     dark = [
         np.clip(level + np.random.default_rng(k).normal(0, 1.5, (64, 208, 3)), 0, 255)
         for k in range(3)
@@ -85,18 +85,18 @@ def test_blank_images_with_a_little_noise_are_refused_and_the_drive_goes_on(leve
     assert found == ["new"] * 3 + ["the image is blank"] * 3 + ["new"] * 3
 
 
-def test_noise_is_refused_also_where_it_repeats() -> None:
+def test_noise_is_refused_also_where_it_repeats():
     found = verdicts([*street()[:2], noise(0), noise(1), noise(1), *street()[5:8]])
     assert found == ["new"] * 2 + ["the image is noise"] * 3 + ["new"] * 3
 
 
-def test_a_camera_that_turns_fast_and_another_scene_are_not_judged_here() -> None:
+def test_a_camera_that_turns_fast_and_another_scene_are_not_judged_here():
     """By half an image a frame, as a hand-held camera may, and by a cut to another place."""
     assert set(verdicts(panned(100.0 * np.arange(6)))) == {"new"}
     assert set(verdicts([*street()[:3], *panned(10.0 * np.arange(3))])) == {"new"}
 
 
-def test_an_image_of_the_same_bytes_is_a_repetition() -> None:
+def test_an_image_of_the_same_bytes_is_a_repetition():
     first, second = street()[:2]
     almost = second.copy()
     almost[0, 0, 0] ^= 1
@@ -114,7 +114,7 @@ def test_an_image_of_the_same_bytes_is_a_repetition() -> None:
 @pytest.mark.parametrize("first", [3, 9])
 def test_ten_re_encoded_copies_are_repetitions_and_the_drive_goes_on(
     hazards: tuple[str, ...], first: int
-) -> None:
+):
     images = street(hazards)
     copies = [jpeg(images[first], quality) for quality in QUALITIES]
     assert len(copies) == 10 and not any(np.array_equal(copy, images[first]) for copy in copies)
@@ -122,7 +122,7 @@ def test_ten_re_encoded_copies_are_repetitions_and_the_drive_goes_on(
     assert found == ["new"] * (first + 1) + ["repeated"] * 10 + ["new"] * (len(images) - first - 11)
 
 
-def test_copies_are_detected_where_every_image_is_compressed() -> None:
+def test_copies_are_detected_where_every_image_is_compressed():
     images = [jpeg(image, 75) for image in street()]
     frozen = [jpeg(street()[9], quality) for quality in QUALITIES]
     assert verdicts([*images[:10], *frozen, *images[20:]]) == ["new"] * 10 + ["repeated"] * 10 + [
@@ -131,7 +131,7 @@ def test_copies_are_detected_where_every_image_is_compressed() -> None:
     assert set(verdicts(images)) == {"new"}
 
 
-def test_a_freeze_of_a_slow_camera_is_detected() -> None:
+def test_a_freeze_of_a_slow_camera_is_detected():
     """At two pixels a frame; the drive goes on where the camera is by then."""
     images = panned(2.0 * np.arange(40))
     frozen = [jpeg(images[9], quality) for quality in QUALITIES]
@@ -142,7 +142,7 @@ def test_a_freeze_of_a_slow_camera_is_detected() -> None:
 
 
 @pytest.mark.parametrize("braking_px", [0.2, 0.4])
-def test_a_camera_that_slows_down_and_stops_is_not_frozen(braking_px: float) -> None:
+def test_a_camera_that_slows_down_and_stops_is_not_frozen(braking_px: float):
     """Every frame is compressed separately, so that no two images of the standing camera have the same bytes."""
     speeds = np.concatenate(
         [np.full(8, 4.0), np.arange(4.0, 0.0, -braking_px), np.zeros(12), np.arange(0.0, 4.0, 0.5)]
@@ -156,7 +156,7 @@ def test_a_camera_that_slows_down_and_stops_is_not_frozen(braking_px: float) -> 
     assert set(verdicts([jpeg(image, 60 + k % 28) for k, image in enumerate(noisy)])) == {"new"}
 
 
-def test_a_simulated_stop_is_not_frozen() -> None:
+def test_a_simulated_stop_is_not_frozen():
     drive = SimulatedStreet(SimulationOptions("straight", 60, 704, 104, 32, ("stop",)))
     steps = np.linalg.norm(np.diff(drive.T_world_camera[:, :3, 3], axis=0), axis=1)
     assert (steps < 1e-9).sum() >= 10 and (steps > 0.5).sum() >= 10
@@ -166,7 +166,7 @@ def test_a_simulated_stop_is_not_frozen() -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["00", "02", "05"])
-def test_freezes_are_detected_on_real_frames(data_root, name: str) -> None:
+def test_freezes_are_detected_on_real_frames(data_root, name: str):
     folder = data_root / "kitti_odometry" / "sequences" / name / "image_0"
     images = [cv2.imread(str(path)) for path in sorted(folder.iterdir())[:60]]
     assert set(verdicts(images)) == {"new"}

@@ -102,7 +102,7 @@ def measured(T: FloatArray, frames: range = range(COUNT - 1), reach: int = 1) ->
 
 
 @pytest.mark.parametrize("reach", [1, 2])
-def test_unit_and_noise_of_the_network_are_measured_on_the_drive(reach: int) -> None:
+def test_unit_and_noise_of_the_network_are_measured_on_the_drive(reach: int):
     T = network_drive(COUNT)
     found = calibrate_network(seen_by_network(T), measured(T, reach=reach), DEPTH_UNIT)
     np.testing.assert_allclose(found.unit, UNIT_METRES * UNIT, rtol=0.02)
@@ -112,7 +112,7 @@ def test_unit_and_noise_of_the_network_are_measured_on_the_drive(reach: int) -> 
     assert translation == pytest.approx(TRANSLATION / np.sqrt(reach), rel=0.15)
 
 
-def test_a_unit_that_drifts_is_noise_of_the_length() -> None:
+def test_a_unit_that_drifts_is_noise_of_the_length():
     T, unit = network_drive(COUNT), UNIT * np.exp(0.3 * np.sin(np.linspace(0, 6, COUNT - 1)))
     steady = calibrate_network(seen_by_network(T), measured(T), DEPTH_UNIT)
     drifting = calibrate_network(seen_by_network(T, unit), measured(T), DEPTH_UNIT)
@@ -121,14 +121,14 @@ def test_a_unit_that_drifts_is_noise_of_the_length() -> None:
     np.testing.assert_allclose(drifting.sigmas[:3], steady.sigmas[:3], rtol=0.05)
 
 
-def test_a_third_of_wrong_steps_does_not_change_the_unit() -> None:
+def test_a_third_of_wrong_steps_does_not_change_the_unit():
     T = network_drive(COUNT)
     geometric = [pose.scaled(3.0) if pose.from_index % 3 == 0 else pose for pose in measured(T)]
     found = calibrate_network(seen_by_network(T), geometric, DEPTH_UNIT)
     assert np.median(found.unit) == pytest.approx(UNIT_METRES * UNIT, rel=0.06)
 
 
-def test_with_few_measured_steps_lengths_are_those_of_learned_depth_and_uncertain() -> None:
+def test_with_few_measured_steps_lengths_are_those_of_learned_depth_and_uncertain():
     T = network_drive(COUNT)
     steps = seen_by_network(T)
     for geometric in (
@@ -143,7 +143,7 @@ def test_with_few_measured_steps_lengths_are_those_of_learned_depth_and_uncertai
         assert abs(UNIT - 1) * factor.T_from_to[2, 3] < 1.5 * factor.sigmas[5]
 
 
-def test_a_gap_of_image_geometry_is_bridged_with_its_true_length() -> None:
+def test_a_gap_of_image_geometry_is_bridged_with_its_true_length():
     T = network_drive(COUNT)
     gaps = [range(k, k + 20) for k in range(30, 260, 45)]
     geometric = [pose for pose in measured(T) if not any(pose.from_index in gap for gap in gaps)]
@@ -157,7 +157,7 @@ def test_a_gap_of_image_geometry_is_bridged_with_its_true_length() -> None:
     assert np.abs(errors).max() < 0.1 and abs(np.mean(errors)) < 0.03
 
 
-def test_stated_noise_of_the_network_holds() -> None:
+def test_stated_noise_of_the_network_holds():
     T, inside = network_drive(COUNT), []
     for seed in range(3):
         steps = seen_by_network(T, seed=seed)
@@ -167,7 +167,7 @@ def test_stated_noise_of_the_network_holds() -> None:
         assert least < np.mean([each[level] for each in inside]) < most
 
 
-def test_the_network_makes_no_drive_shorter() -> None:
+def test_the_network_makes_no_drive_shorter():
     T = network_drive(COUNT)
     geometric, steps = measured(T), seen_by_network(T)
     factors = network_factors(steps, calibrate_network(steps, geometric, DEPTH_UNIT))

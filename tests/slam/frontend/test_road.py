@@ -207,14 +207,14 @@ def error(steps: dict[Ends, RoadStep]) -> float:
 
 
 @pytest.mark.parametrize("degrees", [0.3, 1.0])
-def test_the_path_tells_the_pitch_by_which_lengths_err(degrees: float) -> None:
+def test_the_path_tells_the_pitch_by_which_lengths_err(degrees: float):
     pitch = pitches(degrees)
     measured = road_steps(pitch)
     assert error(measured) > 0.02 * degrees
     assert error(with_slope(measured, drive(pitch))) < 0.3 * error(measured)
 
 
-def test_noisy_directions_count_as_little_as_they_tell() -> None:
+def test_noisy_directions_count_as_little_as_they_tell():
     pitch = pitches(0.3)
     measured, steps = road_steps(pitch), drive(pitch, noise_deg=1.0)
     back = invert(np.array([steps[ends].relative_pose.T_from_to for ends in measured]))[:, :3, 3]
@@ -222,7 +222,7 @@ def test_noisy_directions_count_as_little_as_they_tell() -> None:
     assert error(with_slope(measured, steps)) < 0.5 * error(by_direction)
 
 
-def test_the_path_ends_where_a_step_is_missing() -> None:
+def test_the_path_ends_where_a_step_is_missing():
     pitch = pitches(1.0)
     measured = road_steps(pitch)
     solved = with_slope(measured, drive(pitch, missing=60))

@@ -81,12 +81,12 @@ def drive(
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_a_bias_of_every_measurement_counts_half_as_often_over_two_steps(axis: int) -> None:
+def test_a_bias_of_every_measurement_counts_half_as_often_over_two_steps(axis: int):
     steps, across, truth = drive(SIGMA * np.eye(3)[axis], 0.1 * SIGMA)
     assert error_deg(smooth_rotations(steps, across), truth) < 0.65 * error_deg(steps, truth)
 
 
-def test_a_relative_rotation_that_is_far_off_is_an_outlier() -> None:
+def test_a_relative_rotation_that_is_far_off_is_an_outlier():
     steps, across, truth = drive(np.zeros(3), 0.1 * SIGMA)
     before = error_deg(smooth_rotations(steps, across), truth)
     wrong = Rotation.from_euler("y", 5.0, degrees=True).as_matrix() @ across[10, 12].R_to_from
@@ -94,7 +94,7 @@ def test_a_relative_rotation_that_is_far_off_is_an_outlier() -> None:
     assert error_deg(smooth_rotations(steps, across), truth) < before + 0.02
 
 
-def test_steps_that_are_not_triangulated_stay_and_are_not_crossed() -> None:
+def test_steps_that_are_not_triangulated_stay_and_are_not_crossed():
     steps, across, _ = drive(np.array([SIGMA, 0.0, 0.0]), 0.1 * SIGMA)
     by_points = Motion(steps[20, 21].relative_pose)
     smoothed = smooth_rotations({**steps, (20, 21): by_points}, across)
@@ -104,7 +104,7 @@ def test_steps_that_are_not_triangulated_stay_and_are_not_crossed() -> None:
         np.testing.assert_array_equal(R, rotations_of(smoothed)[ends])
 
 
-def test_directions_follow_rotations_as_far_as_they_are_correlated() -> None:
+def test_directions_follow_rotations_as_far_as_they_are_correlated():
     biased, across, _ = drive(np.array([0.0, SIGMA, 0.0]), 0.1 * SIGMA)
     for correlation in (0.0, 0.9):
         steps = table_of(rotations_of(biased), correlation)
@@ -122,7 +122,7 @@ def test_directions_follow_rotations_as_far_as_they_are_correlated() -> None:
             np.testing.assert_array_equal(after.relative_pose.sigmas, before.relative_pose.sigmas)
 
 
-def test_steps_that_skip_frames_are_smoothed_like_others() -> None:
+def test_steps_that_skip_frames_are_smoothed_like_others():
     """The same drive, whose frames are numbered three apart: every step skips two frames."""
     steps, across, truth = drive(np.array([SIGMA, 0.0, 0.0]), 0.1 * SIGMA)
     expected = rotations_of(smooth_rotations(steps, across))

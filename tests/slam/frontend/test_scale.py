@@ -134,7 +134,7 @@ def test_without_any_road_lengths_stay_unscaled():
 
 
 @pytest.mark.parametrize("height_m", [0.35, 1.65, 3.2])
-def test_lidar_gives_metres_where_no_road_step_and_no_height_is_known(height_m: float) -> None:
+def test_lidar_gives_metres_where_no_road_step_and_no_height_is_known(height_m: float):
     scale = find("lidar", measured(road=False, bias=height_m / HEIGHT_M, lidar=20), None)
     assert scale.is_metric
     assert_lengths(scale, {ends: metres(ends) for ends in SINGLE}, 0.01)
@@ -200,7 +200,7 @@ def test_a_later_estimate_scales_everything_and_a_failure_nothing():
 
 
 @pytest.mark.parametrize(("share", "unit"), [(0.3, "no metric unit"), (0.7, "camera heights")])
-def test_a_floor_seen_now_and_then_gives_no_metric_unit(share: float, unit: str) -> None:
+def test_a_floor_seen_now_and_then_gives_no_metric_unit(share: float, unit: str):
     drive, scans = measured(road=False)
     seen = int(share * FRAMES)
     roads = [*drive.measured.roads[:seen], *[Failed("a table")] * (FRAMES - seen)]
@@ -304,7 +304,7 @@ def motion(ends: Ends, metres: float, unit: float, ratio: float, seconds: float 
     )
 
 
-def test_sigmas_are_those_of_the_whole_system() -> None:
+def test_sigmas_are_those_of_the_whole_system():
     """The chains of Schur complements give the same as inverting the whole matrix."""
     rng = np.random.default_rng(0)
     steps = 7
@@ -327,7 +327,7 @@ def test_sigmas_are_those_of_the_whole_system() -> None:
     np.testing.assert_allclose(with_neighbours, both_sides, atol=1e-9)
 
 
-def test_correlated_sigmas_are_those_of_sums_of_lengths(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_correlated_sigmas_are_those_of_sums_of_lengths(monkeypatch: pytest.MonkeyPatch):
     """Over 40 steps, independent errors of ``relative_correlated_sigma`` add up as the errors of the lengths do."""
     monkeypatch.setattr("slam.frontend.scale.OUTLIER_SIGMAS", 1e9)
     middle = slice(80, 120)
@@ -347,7 +347,7 @@ def test_correlated_sigmas_are_those_of_sums_of_lengths(monkeypatch: pytest.Monk
     assert np.sqrt(np.square(alone).mean()) > 1.5
 
 
-def test_sigmas_are_those_of_the_errors_of_lengths(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sigmas_are_those_of_the_errors_of_lengths(monkeypatch: pytest.MonkeyPatch):
     """Also in the middle of a gap of the road, where there are only triangulation and learned depth."""
     monkeypatch.setattr("slam.frontend.scale.OUTLIER_SIGMAS", 1e9)
     errors, sigmas = [], []
@@ -365,7 +365,7 @@ def test_sigmas_are_those_of_the_errors_of_lengths(monkeypatch: pytest.MonkeyPat
     assert np.mean(sigmas, axis=0)[80] > 1.5 * np.mean(sigmas, axis=0)[30]
 
 
-def test_planes_hold_the_unit_where_the_road_gives_few_lengths() -> None:
+def test_planes_hold_the_unit_where_the_road_gives_few_lengths():
     """The unit of learned depth drifts by half, ratios by chance, and the road is seen in ten steps alone."""
     drift = np.linspace(0.0, 0.4, STEPS)
     road = np.where(np.arange(STEPS) < 10, np.log(TRUE), np.nan)
@@ -386,13 +386,13 @@ def driven(metres: np.ndarray) -> StepEvidence:
     return gather_evidence(links, motions, {}, 10.0)
 
 
-def test_a_step_of_half_a_metre_between_metres_is_an_outlier() -> None:
+def test_a_step_of_half_a_metre_between_metres_is_an_outlier():
     solved = solve_lengths(driven(np.where(np.arange(60) == 30, 0.5, 1.0)), 1.65)
     assert np.flatnonzero(solved.contradicted).tolist() == [30]
     np.testing.assert_allclose(solved.length, 1.0, rtol=0.1)
 
 
-def test_a_stretch_of_half_metres_is_said_and_overruled() -> None:
+def test_a_stretch_of_half_metres_is_said_and_overruled():
     """For ten steps learned depth loses its unit, but no vehicle changes its speed so."""
     solved = solve_lengths(
         driven(np.where((np.arange(60) >= 30) & (np.arange(60) < 40), 0.5, 1.0)), 1.65
@@ -402,7 +402,7 @@ def test_a_stretch_of_half_metres_is_said_and_overruled() -> None:
     assert solved.length.max() / solved.length.min() < 1.15
 
 
-def test_a_car_may_brake() -> None:
+def test_a_car_may_brake():
     """From 20 m/s at 8 m/s2 to 1 m/s."""
     metres = 0.1 * np.maximum(20.0 - 0.8 * np.arange(30), 1.0)
     solved = solve_lengths(driven(metres), 1.65)
@@ -411,7 +411,7 @@ def test_a_car_may_brake() -> None:
 
 
 @pytest.mark.parametrize("stood", [False, True])
-def test_a_unit_that_learned_depth_loses_over_a_gap_is_held_by_the_speed(stood: bool) -> None:
+def test_a_unit_that_learned_depth_loses_over_a_gap_is_held_by_the_speed(stood: bool):
     """20 m/s, six steps that nobody measured, then learned depth of a third, tied by points; or a stop between.
 
     Learned depth wanders, as on a road that the network does not know.

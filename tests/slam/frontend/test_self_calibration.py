@@ -32,7 +32,7 @@ def images(options: SimulationOptions, first: int, last: int) -> Iterator[Frame]
         yield Frame(index, index / 10, street.render(index))
 
 
-def test_a_street_that_turns_shows_its_focal_length() -> None:
+def test_a_street_that_turns_shows_its_focal_length():
     camera = simulated_world(STREET).camera
     wrong, seen = replace(camera, fx=1.25 * camera.fx), follow(images(STREET, 40, 74))
     rounds = np.arange(3)[:, None]
@@ -49,14 +49,14 @@ def test_a_street_that_turns_shows_its_focal_length() -> None:
     assert f"{found.focal * WIDTH / 2:.0f} px ± " in said and "(fov=8" in said
 
 
-def test_a_straight_street_says_that_it_cannot_be_seen() -> None:
+def test_a_straight_street_says_that_it_cannot_be_seen():
     found = find_camera(images(replace(STREET, route="straight"), 0, 28))
     assert found.sigma == UNKNOWN_FX_SIGMA
     said = found.sentence(WIDTH)
     assert "cannot be seen: the camera does not turn" in said and "fov=65 is taken" in said
 
 
-def test_a_lens_is_known_where_the_focal_length_is_not() -> None:
+def test_a_lens_is_known_where_the_focal_length_is_not():
     """A straight street through a lens that draws corners in by an eighth; it bends the paths of the points."""
     straight = replace(STREET, route="straight", height=208)
     half, radial = WIDTH / 2, -0.12

@@ -65,9 +65,7 @@ def scene(
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_camera_is_found_among_outliers_and_inliers_are_rows_of_the_points_given(
-    seed: int,
-) -> None:
+def test_a_camera_is_found_among_outliers_and_inliers_are_rows_of_the_points_given(seed: int):
     points, pixels, is_inlier = scene(5)
     T_start, inliers = consensus(points, pixels, K, 200, 2.0, seed)
     assert set(inliers) <= set(np.flatnonzero(is_inlier)) and len(inliers) > 60
@@ -77,14 +75,14 @@ def test_a_camera_is_found_among_outliers_and_inliers_are_rows_of_the_points_giv
     assert np.linalg.norm(error[:3, 3]) < 0.05
 
 
-def test_pixels_without_a_common_camera_have_none() -> None:
+def test_pixels_without_a_common_camera_have_none():
     points, _, _ = scene(0)
     pixels = np.random.default_rng(1).uniform(0.0, 300.0, (100, 2))
     _, inliers = consensus(points, pixels, K, 200, 0.5)
     assert len(inliers) < 12
 
 
-def test_sigmas_are_those_of_the_errors_of_refined_cameras() -> None:
+def test_sigmas_are_those_of_the_errors_of_refined_cameras():
     whitened = []
     for seed in range(60):
         points, pixels, _ = scene(seed, noise_px=0.5, outliers=0)
@@ -103,7 +101,7 @@ def test_sigmas_are_those_of_the_errors_of_refined_cameras() -> None:
     assert (rms > 0.7).all() and (rms < 1.4).all(), rms
 
 
-def test_an_order_is_a_permutation_by_its_seed() -> None:
+def test_an_order_is_a_permutation_by_its_seed():
     np.testing.assert_array_equal(ransac_order(50, 0), np.arange(50))
     one, same, other = ransac_order(50, 1), ransac_order(50, 1), ransac_order(50, 2)
     np.testing.assert_array_equal(one, same)
@@ -118,7 +116,7 @@ def seen(count: int = 80) -> tuple[FloatArray, FloatArray]:
     return points, homogeneous[:, :2] / homogeneous[:, 2:]
 
 
-def test_jacobian_is_the_derivative_of_the_pixels() -> None:
+def test_jacobian_is_the_derivative_of_the_pixels():
     X = apply(T_TRUE, seen(10)[0])
     focal = np.array([500.0, 400.0])
     for axis in range(6):
@@ -131,14 +129,14 @@ def test_jacobian_is_the_derivative_of_the_pixels() -> None:
         np.testing.assert_allclose(pixel_jacobian(X, focal)[axis].T, numeric, atol=1e-4)
 
 
-def test_finds_the_pose_from_a_far_guess() -> None:
+def test_finds_the_pose_from_a_far_guess():
     points, pixels = seen()
     pose = resect((np.eye(4),), points, pixels, INTRINSICS.K)
     np.testing.assert_allclose(pose.T_camera_world, T_TRUE, atol=1e-6)
     assert pose.residual_px.max() < 1e-3
 
 
-def test_a_camera_that_moves_and_turns_steadily_stays_rigid() -> None:
+def test_a_camera_that_moves_and_turns_steadily_stays_rigid():
     """Each pose begins at the one predicted by the last two, which fits."""
     rng = np.random.default_rng(1)
     T_step = from_rotation_vector(np.array([0.002, 0.02, 0.001]), np.array([0.01, 0.0, -0.03]))
@@ -155,7 +153,7 @@ def test_a_camera_that_moves_and_turns_steadily_stays_rigid() -> None:
     assert rotation_angle(now[:3, :3] @ true[:3, :3].T) < 1e-6
 
 
-def test_a_wrong_prediction_does_not_outweigh_the_last_pose() -> None:
+def test_a_wrong_prediction_does_not_outweigh_the_last_pose():
     points, pixels = seen()
     pixels[:20] += 25.0
     wrong = from_rotation_vector(np.array([0.0, 0.8, 0.0]), np.array([1.0, 0.0, 0.0])) @ T_TRUE
@@ -166,7 +164,7 @@ def test_a_wrong_prediction_does_not_outweigh_the_last_pose() -> None:
     assert (pose.residual_px[:20] > 3.0).all()
 
 
-def test_points_of_uncertain_depth_give_the_turn_and_only_the_direction_of_a_step() -> None:
+def test_points_of_uncertain_depth_give_the_turn_and_only_the_direction_of_a_step():
     """All points at wrong depths: the pose is right, with what their parallax is off taken as their uncertainty."""
     points, pixels = seen(200)
     first = np.linalg.inv(T_TRUE)[:3, 3] + [0.2, 0.05, 0.0]
@@ -182,7 +180,7 @@ def test_points_of_uncertain_depth_give_the_turn_and_only_the_direction_of_a_ste
     assert np.median(known.residual_px) < 0.5 * np.median(exact.residual_px)
 
 
-def test_the_majority_is_not_the_world_where_others_have_the_vote() -> None:
+def test_the_majority_is_not_the_world_where_others_have_the_vote():
     points, pixels = seen(200)
     trusted = np.arange(200) < 50
     T_moved = from_rotation_vector(np.array([0.0, 0.05, 0.0]), np.array([0.1, 0.0, 0.0])) @ T_TRUE
@@ -217,7 +215,7 @@ def degrees_between(found: UnitRelativePose) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 7])
-def test_both_consensus_methods_find_the_motion_among_outliers(seed: int) -> None:
+def test_both_consensus_methods_find_the_motion_among_outliers(seed: int):
     previous, current, depth = matched_rays(noise_px=0.1, outliers=30)
     depth[::9] = np.nan
     tolerance = 1.0 / FOCAL_PX
@@ -230,7 +228,7 @@ def test_both_consensus_methods_find_the_motion_among_outliers(seed: int) -> Non
         assert rotation_deg < 0.5 and direction_deg < 10.0  # of minimal samples, to be refined
 
 
-def test_too_few_points_have_no_motion() -> None:
+def test_too_few_points_have_no_motion():
     previous, current, depth = matched_rays()
     assert (
         unit_pose_by_pnp(previous, current, np.where(np.arange(120) < 7, depth, np.nan), 1e-2)
@@ -238,7 +236,7 @@ def test_too_few_points_have_no_motion() -> None:
     )
 
 
-def test_depths_are_triangulated_in_both_cameras() -> None:
+def test_depths_are_triangulated_in_both_cameras():
     previous, current, depth = matched_rays()
     found = triangulated_depth(previous, current, UNIT_POSE)
     np.testing.assert_allclose(found * LENGTH, depth, rtol=1e-9)
@@ -250,7 +248,7 @@ def test_depths_are_triangulated_in_both_cameras() -> None:
     assert (triangulated_depth(previous, current, backwards) < 0).all()
 
 
-def test_parallax_is_the_flow_without_that_of_the_rotation() -> None:
+def test_parallax_is_the_flow_without_that_of_the_rotation():
     previous, _, _ = matched_rays()
     rotated = previous @ UNIT_POSE.R_current_previous.T
     rotated /= rotated[:, 2:]
@@ -264,7 +262,7 @@ def test_parallax_is_the_flow_without_that_of_the_rotation() -> None:
     )
 
 
-def test_a_pure_rotation_is_found_with_a_fifth_of_outliers() -> None:
+def test_a_pure_rotation_is_found_with_a_fifth_of_outliers():
     previous, _, _ = matched_rays()
     rotated = previous @ UNIT_POSE.R_current_previous.T
     rotated /= rotated[:, 2:]

@@ -111,7 +111,7 @@ def test_correlated_sigmas_weigh_a_chain_against_a_loop_and_leave_sigmas_as_they
     np.testing.assert_array_equal(of_chained, whitened_squared(odometry, truth))
 
 
-def test_wrong_input_is_refused_with_its_name(tmp_path: Path) -> None:
+def test_wrong_input_is_refused_with_its_name(tmp_path: Path):
     truth = circle(5)
     good = edge(truth, 0, 1)
     graph = PoseGraph()
@@ -150,7 +150,7 @@ def test_wrong_input_is_refused_with_its_name(tmp_path: Path) -> None:
         graph.marginal(5)
 
 
-def test_drift_of_a_straight_chain_by_hand() -> None:
+def test_drift_of_a_straight_chain_by_hand():
     """The variance of the k-th of eight positions is 3 k 0.1^2, over a path of 8."""
     sigmas = np.repeat([1e-6, 0.1], 3)
     step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
@@ -195,7 +195,7 @@ def test_g2o_round_trip_through_gtsam(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_system_that_cannot_be_solved_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_system_that_cannot_be_solved_is_one_line(monkeypatch: pytest.MonkeyPatch):
     _, odometry, _, loops, initial = noisy_problem(count=40)
 
     def singular(*parts: Any) -> None:

@@ -85,7 +85,7 @@ def closed(seed: int) -> tuple[Drive, Estimate]:
 
 
 @pytest.mark.parametrize("seed", [610, pytest.param(611, marks=pytest.mark.slow)])
-def test_a_loop_is_closed_and_cuts_the_error(seed: int) -> None:
+def test_a_loop_is_closed_and_cuts_the_error(seed: int):
     sequence, result = closed(seed)
     accepted = result.loops.accepted
     assert len(accepted) >= 5
@@ -105,7 +105,7 @@ def test_a_loop_is_closed_and_cuts_the_error(seed: int) -> None:
 
 
 @pytest.mark.slow
-def test_loops_of_a_drive_without_metres_are_those_of_one_with() -> None:
+def test_loops_of_a_drive_without_metres_are_those_of_one_with():
     """In a unit of 20 m, where 15 units are longer than the loop, and in one of 5 cm."""
     sequence, result = closed(610)
     per_frame = result.scale.per_frame
@@ -125,7 +125,7 @@ def test_loops_of_a_drive_without_metres_are_those_of_one_with() -> None:
 
 
 @pytest.mark.slow
-def test_a_car_that_waits_at_a_place_has_one_loop_there() -> None:
+def test_a_car_that_waits_at_a_place_has_one_loop_there():
     """It stands where a loop ends, for 20 views of the same image, whose loops say the same again and again."""
     sequence, result = closed(610)
     loop = result.loops.accepted[-1]
@@ -147,7 +147,7 @@ def test_a_car_that_waits_at_a_place_has_one_loop_there() -> None:
     )
 
 
-def test_a_straight_drive_has_no_loop() -> None:
+def test_a_straight_drive_has_no_loop():
     result = run(Drive("straight", 40, 620))
     assert result.loops.accepted == () and result.loops.candidates > 0
 
@@ -167,13 +167,13 @@ def loop(earlier: int, later: int, T: FloatArray, shift: float = 0.0, inliers: i
     return Loop(RelativePose(earlier, later, T_from_to, SIGMAS, LOOP_SOURCE), inliers, 0.5)
 
 
-def test_loops_of_one_stretch_support_each_other_despite_drift() -> None:
+def test_loops_of_one_stretch_support_each_other_despite_drift():
     true = [loop(k, 200 + k, ring()) for k in range(0, 40, 4)]
     kept, refused = agreeing(true, Track.of_drive(ring(yaw_error=0.0005)), OF_FRAMES)
     assert len(kept) == 10 and refused == []
 
 
-def test_a_contradicted_loop_is_refused() -> None:
+def test_a_contradicted_loop_is_refused():
     true = [loop(k, 200 + k, ring()) for k in range(0, 40, 4)]
     kept, refused = agreeing(
         [*true, loop(6, 206, ring(), shift=8.0)], Track.of_drive(ring()), OF_FRAMES
@@ -182,7 +182,7 @@ def test_a_contradicted_loop_is_refused() -> None:
     assert [r.from_index for r in refused] == [6] and "contradicted by 7 of 7" in refused[0].reason
 
 
-def test_a_loop_without_support_needs_many_inliers() -> None:
+def test_a_loop_without_support_needs_many_inliers():
     for inliers, expected in ((40, 0), (300, 1)):
         kept, refused = agreeing(
             [loop(5, 205, ring(), inliers=inliers)], Track.of_drive(ring()), OF_FRAMES
@@ -194,7 +194,7 @@ def test_a_loop_without_support_needs_many_inliers() -> None:
     )
 
 
-def test_loops_that_move_the_trajectory_too_far_are_refused() -> None:
+def test_loops_that_move_the_trajectory_too_far_are_refused():
     far = [loop(k, 100 + k, ring(), shift=-60.0, inliers=300) for k in range(0, 40, 4)]
     kept, refused = agreeing(far, Track.of_drive(ring()), OF_FRAMES)
     assert kept == [] and all(
@@ -202,7 +202,7 @@ def test_loops_that_move_the_trajectory_too_far_are_refused() -> None:
     )
 
 
-def test_a_loop_between_maps_may_not_contradict_the_motion_between_them() -> None:
+def test_a_loop_between_maps_may_not_contradict_the_motion_between_them():
     """Two maps of one drive: where odometry relates them, a loop is bound by it, else by other loops alone."""
     track = Track.of_drive(ring())
     maps = (track.frames >= 150).astype(np.intp)
@@ -213,7 +213,7 @@ def test_a_loop_between_maps_may_not_contradict_the_motion_between_them() -> Non
     assert len(agreeing(far, replace(track, maps=maps, path=unrelated), OF_FRAMES)[0]) == 1
 
 
-def test_loops_over_a_doubtful_step_agree_on_another_unit() -> None:
+def test_loops_over_a_doubtful_step_agree_on_another_unit():
     """The second of two maps that odometry relates has lengths three times too long: one loop alone may not say so."""
     track = Track.of_drive(ring())
     maps = (track.frames >= 150).astype(np.intp)
@@ -262,7 +262,7 @@ def apart(path: np.ndarray) -> Apart:
     return lambda rows: (frames[rows, None] - frames >= 30) & (path[rows, None] - path >= 15.0)
 
 
-def test_revisited_places_are_found() -> None:
+def test_revisited_places_are_found():
     views = drive(20, 5)
     found = find_candidates(views, apart(np.arange(50.0)), OF_FRAMES)
     best = {}
@@ -275,11 +275,11 @@ def test_revisited_places_are_found() -> None:
 
 
 @pytest.mark.parametrize("path_m", [np.zeros(50), np.linspace(0.0, 4.0, 50)])
-def test_a_standing_camera_finds_nothing(path_m: np.ndarray) -> None:
+def test_a_standing_camera_finds_nothing(path_m: np.ndarray):
     assert find_candidates(drive(20, 5), apart(path_m), OF_FRAMES) == []
 
 
-def test_candidates_are_few_and_apart() -> None:
+def test_candidates_are_few_and_apart():
     found = find_candidates(drive(20, 5), apart(np.arange(50.0)), OF_FRAMES)
     for later in {c.later for c in found}:
         earlier = [c.earlier for c in found if c.later == later]

@@ -12,7 +12,7 @@ from slam.simulation.street import SimulatedStreet
 SIZE = (312, 96)
 
 
-def test_features_are_spread_and_bounded() -> None:
+def test_features_are_spread_and_bounded():
     street = SimulatedStreet(SimulationOptions("straight", 20, 621, *SIZE))
     intrinsics = Intrinsics(*SIZE, *street.K[[0, 1, 0, 1], [0, 1, 2, 2]])
     extractor = FeatureExtractor(intrinsics)
@@ -36,7 +36,7 @@ def place(rng: np.random.Generator) -> np.ndarray:
     return rng.integers(0, 256, (80, 32), dtype=np.uint8)
 
 
-def test_hamming_counts_bits() -> None:
+def test_hamming_counts_bits():
     rng = np.random.default_rng(1)
     first, second = place(rng), place(rng)[:50]
     slow = np.unpackbits(first[:, None] ^ second[None], axis=2).sum(axis=2)

@@ -4,7 +4,7 @@ from slam.geometry.se3 import apply, from_rotation_vector, invert
 from slam.loops.places import reprojection_errors, triangulate
 
 
-def test_points_and_angles_of_exact_rays() -> None:
+def test_points_and_angles_of_exact_rays():
     rng = np.random.default_rng(0)
     X = rng.uniform((-1.0, -1.0, 3.0), (1.0, 1.0, 5.0), (8, 3))
     T = invert(
@@ -21,14 +21,14 @@ def test_points_and_angles_of_exact_rays() -> None:
     assert abs(angle[0] - np.arccos(one @ other)) < 1e-9
 
 
-def test_parallel_rays_give_no_point() -> None:
+def test_parallel_rays_give_no_point():
     T = np.tile(np.eye(4), (2, 1, 1))
     found, angle = triangulate(T, np.array([[0.1, 0.0, 1.0]] * 2), np.zeros(2, np.int64), 1)
     assert np.isnan(found).all()
     assert angle[0] < 1e-6
 
 
-def test_reprojection_errors_by_hand() -> None:
+def test_reprojection_errors_by_hand():
     points = np.array([[0.0, 0.0, 2.0], [1.0, 0.5, 2.0], [0.0, 0.0, -1.0]])
     rays = np.array([[0.0, 0.0, 1.0], [0.47, 0.29, 1.0], [0.0, 0.0, 1.0]])
     errors = reprojection_errors(np.tile(np.eye(4), (3, 1, 1)), points, rays, (100.0, 100.0))

@@ -57,7 +57,7 @@ def error(loop: Loop, T_true: FloatArray) -> tuple[float, float]:
     )
 
 
-def test_exact_points_give_the_pose() -> None:
+def test_exact_points_give_the_pose():
     loop = verify(*Scene().views())
     assert isinstance(loop, Loop) and loop.ends == (3, 90) and loop.measured.source == LOOP_SOURCE
     np.testing.assert_allclose(loop.measured.T_from_to, T_A_B, atol=1e-3)
@@ -65,7 +65,7 @@ def test_exact_points_give_the_pose() -> None:
 
 
 @pytest.mark.parametrize("unit", [0.01, 1.0, 50.0])
-def test_verdict_does_not_depend_on_the_unit(unit: float) -> None:
+def test_verdict_does_not_depend_on_the_unit(unit: float):
     loop = verify(*Scene(unit=unit).views())
     assert isinstance(loop, Loop)
     scaled = T_A_B.copy()
@@ -74,9 +74,7 @@ def test_verdict_does_not_depend_on_the_unit(unit: float) -> None:
     assert loop.measured.sigmas[3] == pytest.approx(unit * 0.085, rel=0.1)
 
 
-def test_sigmas_grow_with_the_error_of_corners_and_cover_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_sigmas_grow_with_the_error_of_corners_and_cover_it(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(verification, "_LENGTH_RELATIVE_SIGMA", 1e-6)
     whitened, sizes = [], []
     T_a_b = from_rotation_vector(np.array([0.0, 0.05, 0.0]), np.array([0.5, 0.0, 0.0]))
@@ -96,7 +94,7 @@ def test_sigmas_grow_with_the_error_of_corners_and_cover_it(
     assert np.median(sizes[12:]) > 1.5 * np.median(sizes[:12])
 
 
-def test_wrong_matches_are_ransac_outliers() -> None:
+def test_wrong_matches_are_ransac_outliers():
     earlier, later = Scene().views()
     later.pixels[:80] = np.random.default_rng(1).uniform([0, 0], [415, 127], (80, 2))
     loop = verify(earlier, later)
@@ -104,14 +102,14 @@ def test_wrong_matches_are_ransac_outliers() -> None:
     assert error(loop, T_A_B)[0] < 0.05
 
 
-def test_another_place_is_refused() -> None:
+def test_another_place_is_refused():
     earlier, later = Scene().views()
     other = np.random.default_rng(5).integers(0, 256, later.descriptors.shape, dtype=np.uint8)
     verdict = verify(earlier, View(90, later.pixels, other, later.points))
     assert isinstance(verdict, RejectedLoop) and "matches" in verdict.reason
 
 
-def test_directions_that_disagree_are_refused() -> None:
+def test_directions_that_disagree_are_refused():
     """The later image's depth is larger than the earlier one's: both directions measure different poses."""
     earlier, later = Scene(from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 5.0]))).views()
     verdict = verify(earlier, later.scaled(1.6))

@@ -27,20 +27,20 @@ def refiner(distances: np.ndarray, read: list[int]) -> DepthRefiner:
 
 
 @pytest.mark.parametrize(("step_m", "expected"), [(1.0, {9, 10, 11, 12}), (0.1, {10, 3, 17, 30})])
-def test_neighbours_are_chosen_by_their_distance(step_m: float, expected: set[int]) -> None:
+def test_neighbours_are_chosen_by_their_distance(step_m: float, expected: set[int]):
     read: list[int] = []
     offset = 20 if step_m < 1 else 0
     assert refiner(np.arange(80) * step_m, read).refine(10 + offset, DEPTH) is not None
     assert {k - offset for k in read} == expected
 
 
-def test_the_last_keyframe_has_its_neighbours_before_it() -> None:
+def test_the_last_keyframe_has_its_neighbours_before_it():
     read: list[int] = []
     assert refiner(np.arange(20.0), read).refine(19, DEPTH) is not None
     assert set(read) == {17, 18, 19}
 
 
-def test_what_is_unknown_begins_with_its_neighbours_and_is_not_believed_unmeasured() -> None:
+def test_what_is_unknown_begins_with_its_neighbours_and_is_not_believed_unmeasured():
     holes = DEPTH.copy()
     holes[10:20, 20:40] = 0
     holes[0, :2] = np.nan, np.inf

@@ -76,7 +76,7 @@ def street() -> tuple[Ply, FloatArray]:
     return together(ground, *parts), poses
 
 
-def test_the_ground_follows_slope_and_bank(street: tuple[Ply, FloatArray]) -> None:
+def test_the_ground_follows_slope_and_bank(street: tuple[Ply, FloatArray]):
     mesh, poses = street
     ground_at = ground_along(mesh.points, poses, 1.5)
     x, y = (each.ravel() for each in np.meshgrid([-6.0, 0.0, 6.0], [2.0, 10.0, 30.0, 50.0]))
@@ -87,7 +87,7 @@ def test_the_ground_follows_slope_and_bank(street: tuple[Ply, FloatArray]) -> No
 @pytest.mark.parametrize(("resolution", "unit"), [(0.1, 1.0), (0.25, 1 / CAMERA_HEIGHT)])
 def test_what_is_free_and_what_is_occupied(
     street: tuple[Ply, FloatArray], resolution: float, unit: float
-) -> None:
+):
     mesh, poses = street
     vertices = mesh.vertices.copy()
     for axis in "xyz":
@@ -113,9 +113,7 @@ def test_what_is_free_and_what_is_occupied(
     assert (values == OCCUPIED).sum() * step**2 == pytest.approx(2 * 4 + 60 * step, rel=0.15)
 
 
-def test_narrow_gaps_of_the_road_are_closed_and_wide_ones_unknown(
-    street: tuple[Ply, FloatArray],
-) -> None:
+def test_narrow_gaps_of_the_road_are_closed_and_wide_ones_unknown(street: tuple[Ply, FloatArray]):
     _, poses = street
     parts = [level((-3, 3.2), along, 0.0) for along in ((-1, 10), (10.2, 20), (21.5, 60))]
     values, _ = occupancy_grid(together(*parts), poses, 0.1, True)
@@ -127,13 +125,13 @@ def test_narrow_gaps_of_the_road_are_closed_and_wide_ones_unknown(
     assert {y: set(row.tolist()) for y, row in of_y.items()} == expected
 
 
-def test_a_map_without_ground_is_refused(street: tuple[Ply, FloatArray]) -> None:
+def test_a_map_without_ground_is_refused(street: tuple[Ply, FloatArray]):
     _, poses = street
     with pytest.raises(RunError, match="no ground below the cameras"):
         occupancy_grid(level((-3, 3), (0, 50), 5.0), poses, 0.2, True)
 
 
-def test_large_triangles_leave_no_holes(street: tuple[Ply, FloatArray]) -> None:
+def test_large_triangles_leave_no_holes(street: tuple[Ply, FloatArray]):
     """Two triangles from 20 m on; before them a vertex every 0.2 m, by which the ground is known."""
     corners = np.array([[-5, 20, 0], [5, 20, 0], [5, 60, 0], [-5, 60, 0]], float)
     corners[:, 2] = -CAMERA_HEIGHT

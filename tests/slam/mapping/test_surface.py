@@ -21,7 +21,7 @@ from slam.mapping.surface import TileSurface, extract_tile, with_holes_closed
 
 def test_the_order_of_vertices_in_one_place_is_that_of_their_triangles(
     monkeypatch: pytest.MonkeyPatch,
-) -> None:
+):
     """Open3D's threads give them in any; here two triangles touch in a corner that each has for itself."""
     vertices = np.array([[1, 1, 1], [2, 1, 1], [1, 2, 1], [1, 1, 1], [0.5, 1, 1], [1, 1, 0.5]])
     triangles = np.array([[0, 1, 2], [3, 4, 5]])

@@ -41,7 +41,7 @@ def depths(
     return keyframe_depths(drive, scale, T_world_camera, CAMERA, decide, guess_sigma)
 
 
-def test_what_no_neighbour_measures_has_the_sigma_of_a_guess() -> None:
+def test_what_no_neighbour_measures_has_the_sigma_of_a_guess():
     standing = depths(0.0, guess_sigma=0.32)(2)
     assert standing.relative_sigma is not None
     np.testing.assert_allclose(standing.relative_sigma, 0.32)
@@ -54,7 +54,7 @@ def sure(measurement: Measurement) -> RefinedDepth:
     return RefinedDepth(depth, np.full_like(depth, 0.1), np.ones(depth.shape, bool))
 
 
-def test_what_is_fixed_to_the_camera_is_unknown_whatever_its_neighbours_say() -> None:
+def test_what_is_fixed_to_the_camera_is_unknown_whatever_its_neighbours_say():
     sigma = depths(0.4, None, sure)(2).relative_sigma
     assert sigma is not None and np.isinf(sigma[24:]).all()
     np.testing.assert_allclose(sigma[:24], 0.1)

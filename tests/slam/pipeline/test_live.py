@@ -52,7 +52,7 @@ def feed(slam: Slam, first: int, stop: int) -> None:
 
 
 @pytest.mark.slow
-def test_the_last_frames_are_measured_again_and_at_the_end_the_drive_as_in_one_run() -> None:
+def test_the_last_frames_are_measured_again_and_at_the_end_the_drive_as_in_one_run():
     config = load_config(None, SETTINGS)
     slam = started(config)
     feed(slam, 0, FRAMES - 9)
@@ -71,7 +71,7 @@ def test_the_last_frames_are_measured_again_and_at_the_end_the_drive_as_in_one_r
     np.testing.assert_allclose(live.T_world_camera, batch.optimised.T_world_camera, atol=0.02)
 
 
-def test_poses_of_the_whole_drive_stay_when_more_frames_come() -> None:
+def test_poses_of_the_whole_drive_stay_when_more_frames_come():
     slam = started(load_config(None, SETTINGS))
     feed(slam, 0, 32)
     slam.close_loops()
@@ -80,7 +80,7 @@ def test_poses_of_the_whole_drive_stay_when_more_frames_come() -> None:
     np.testing.assert_array_equal(slam.trajectory().T_world_camera[:32], before)
 
 
-def test_the_trajectory_grows_with_the_frames() -> None:
+def test_the_trajectory_grows_with_the_frames():
     slam = started(load_config(None, SETTINGS))
     with pytest.raises(SlamError, match="before the first frame"):
         slam.trajectory()
@@ -92,7 +92,7 @@ def test_the_trajectory_grows_with_the_frames() -> None:
         assert distance == 0.0 if count < 5 else 0.5 * count < distance < 1.5 * count
 
 
-def test_a_frame_gives_the_newest_pose_and_its_state() -> None:
+def test_a_frame_gives_the_newest_pose_and_its_state():
     slam = started(load_config(None, SETTINGS))
     poses = [slam.add_frame(drive().frame(k).image, drive().frame(k).stamp) for k in range(20)]
     assert poses[0].state == "starting" and poses[-1].state == "tracking"
@@ -104,7 +104,7 @@ def test_a_frame_gives_the_newest_pose_and_its_state() -> None:
     )
 
 
-def test_a_session_gives_its_points_keyframes_marginals_and_surface() -> None:
+def test_a_session_gives_its_points_keyframes_marginals_and_surface():
     slam = started(load_config(None, SETTINGS), with_map=True)
     with pytest.raises(SlamError, match="too few usable frames"):
         slam.points()
@@ -137,7 +137,7 @@ def test_a_session_gives_its_points_keyframes_marginals_and_surface() -> None:
         plain.surface()
 
 
-def test_the_camera_stays_at_its_place_until_there_is_a_unit() -> None:
+def test_the_camera_stays_at_its_place_until_there_is_a_unit():
     """Image geometry measures steps before the first snippet, but not their lengths."""
     slam = started(load_config(None, SETTINGS[1:]))
     for count in range(1, 5):
@@ -148,7 +148,7 @@ def test_the_camera_stays_at_its_place_until_there_is_a_unit() -> None:
     assert slam.unit_name == "m" and lengths.min() > 0.5 and lengths.max() < 1.5
 
 
-def test_blank_frames_are_interpolated() -> None:
+def test_blank_frames_are_interpolated():
     slam = started(load_config(None, SETTINGS))
     feed(slam, 0, 12)
     for k in range(12, 17):
@@ -159,7 +159,7 @@ def test_blank_frames_are_interpolated() -> None:
     assert np.linalg.norm(slam.trajectory().positions - reference[:30, :3, 3], axis=1).max() < 3.0
 
 
-def test_the_camera_stays_rigid_over_a_gap_longer_than_its_window() -> None:
+def test_the_camera_stays_rigid_over_a_gap_longer_than_its_window():
     slam = started(load_config(None, SETTINGS))
     feed(slam, 0, 12)
     for k in range(12, 120):
@@ -167,7 +167,7 @@ def test_the_camera_stays_rigid_over_a_gap_longer_than_its_window() -> None:
     assert is_se3(slam.trajectory().T_world_camera, tolerance=1e-12)
 
 
-def test_wrong_frames_and_modes_are_refused() -> None:
+def test_wrong_frames_and_modes_are_refused():
     slam = started(load_config(None, SETTINGS))
     image = drive().frame(0).image
     with pytest.raises(ValueError, match=r"image must be \(96, 312, 3\) uint8; got \(96, 312\)"):
@@ -200,7 +200,7 @@ def test_wrong_frames_and_modes_are_refused() -> None:
         ("camera_height_m", np.nan),
     ],
 )
-def test_an_impossible_camera_is_refused(key: str, value: float) -> None:
+def test_an_impossible_camera_is_refused(key: str, value: float):
     intrinsics, height = drive().intrinsics, {}
     if key == "camera_height_m":
         height = {key: value}
@@ -210,7 +210,7 @@ def test_an_impossible_camera_is_refused(key: str, value: float) -> None:
         Slam(oracle(), intrinsics, load_config(None, SETTINGS), **height)
 
 
-def test_depth_that_is_no_depth_of_the_image_is_refused() -> None:
+def test_depth_that_is_no_depth_of_the_image_is_refused():
     class Small(OraclePredictor):
         def depth(self, frame: Frame) -> DepthMap:
             return super().depth(frame)[::2, ::2]
@@ -249,7 +249,7 @@ class Failing(OraclePredictor):
 @pytest.mark.parametrize("question", ["depth", "snippet"])
 def test_a_frame_whose_measurement_fails_is_a_gap_and_the_session_goes_on(
     question: str, following: str, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     """An error that nobody foresaw costs a frame: one row a frame, whether the next image is usable or not."""
     predictor = Failing(8, question)
     config = load_config(None, [*SETTINGS, "visual_odometry.enabled=true", "loops.enabled=false"])
@@ -271,7 +271,7 @@ def test_a_frame_whose_measurement_fails_is_a_gap_and_the_session_goes_on(
     assert np.linalg.norm(trajectory.positions[-1]) > 0.5 * np.linalg.norm(reference[19, :3, 3])
 
 
-def test_a_closed_session_has_no_threads_and_keeps_its_results() -> None:
+def test_a_closed_session_has_no_threads_and_keeps_its_results():
     before = set(threading.enumerate())
     config = load_config(None, [*SETTINGS, "visual_odometry.enabled=true"])
     with started(config) as slam, started(config) as other:
@@ -287,7 +287,7 @@ def test_a_closed_session_has_no_threads_and_keeps_its_results() -> None:
     slam.close()
 
 
-def test_a_buffer_that_is_reused_is_a_new_frame() -> None:
+def test_a_buffer_that_is_reused_is_a_new_frame():
     """A camera driver may write every image to the same memory."""
     config = load_config(None, ["mapping.enabled=false", "loops.enabled=false"])
     slam, buffered = (started(config) for _ in range(2))

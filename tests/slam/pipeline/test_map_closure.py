@@ -33,7 +33,7 @@ def closed(state: KeyframeOdometry) -> MapClosure:
 
 
 @pytest.mark.slow
-def test_maps_before_and_after_a_loss_are_joined_where_the_camera_is_rolled_and_closer() -> None:
+def test_maps_before_and_after_a_loss_are_joined_where_the_camera_is_rolled_and_closer():
     truth, state = lost_on_the_way()
     assert sum(segment.started for segment in state.segments) == 2
     assert [event.event for event in state.events] == ["map begun", "lost", "map begun"]
@@ -78,7 +78,7 @@ def lap(number: int, forth: bool, unit: float) -> LocalMap:
 
 def test_the_unit_of_one_wall_follows_from_two_laps_and_the_turns_between_them(
     monkeypatch: pytest.MonkeyPatch,
-) -> None:
+):
     """Loops join each wall's maps, three turns lead from one wall to the other, whose unit is 1.6 times as long."""
     maps = [lap(number, number % 2 == 0, 1.6 if number % 2 else 1.0) for number in range(4)]
     half = make(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
@@ -109,7 +109,7 @@ def test_the_unit_of_one_wall_follows_from_two_laps_and_the_turns_between_them(
 
 
 @pytest.mark.slow
-def test_another_scene_is_no_loop() -> None:
+def test_another_scene_is_no_loop():
     walked = room.there_and_back(110)
     after = closed(room.tracked(np.concatenate([walked[:45], walked[:45]]), [0] * 45 + [7] * 45))
     assert after.loops.accepted == ()
@@ -119,7 +119,7 @@ def test_another_scene_is_no_loop() -> None:
 
 @pytest.mark.data
 @pytest.mark.slow
-def test_a_real_hand_held_recording_and_its_loops(data_root: Path) -> None:
+def test_a_real_hand_held_recording_and_its_loops(data_root: Path):
     """With flat learned depth: no network takes part."""
     recording = data_root / "handheld_kitchen"
     sequence = open_sequence(recording / "images")

@@ -161,7 +161,7 @@ def ate(result: Estimate) -> float:
     ],
     ids=lambda damage: damage.__name__,
 )
-def test_ten_frames_are_interpolated_and_reported(damage: Damage) -> None:
+def test_ten_frames_are_interpolated_and_reported(damage: Damage):
     result, warnings = run_on(damage)
     for each in (result.network, result.odometry, result.optimised):
         assert len(each) == FRAMES and np.isfinite(each.T_world_camera).all()
@@ -184,7 +184,7 @@ def test_ten_frames_are_interpolated_and_reported(damage: Damage) -> None:
     assert not {view.index for view in seen.views} & set(BAD)
 
 
-def test_no_road_is_measured_in_the_sky() -> None:
+def test_no_road_is_measured_in_the_sky():
     """Of images that are upside down."""
 
     def turned(sequence: SimulatedSequence, index: int) -> Frame:
@@ -199,7 +199,7 @@ def test_no_road_is_measured_in_the_sky() -> None:
     assert not run_on(black)[0].drive.measured.is_upside_down
 
 
-def test_doubled_frames_are_counted_and_cost_nothing() -> None:
+def test_doubled_frames_are_counted_and_cost_nothing():
     """Two frames come twice; the drive goes on where it was."""
     rows = sorted([*range(FRAMES - 2), 12, 25])
 
@@ -225,13 +225,13 @@ def rolling_exposure(sequence: SimulatedSequence, index: int) -> Frame:
 
 
 @pytest.mark.slow
-def test_rolling_exposure_is_reported(caplog: pytest.LogCaptureFixture) -> None:
+def test_rolling_exposure_is_reported(caplog: pytest.LogCaptureFixture):
     run(rolling_exposure, range(FRAMES), "mapping.enabled=false")
     assert "the exposure rolls: " in caplog.text
 
 
 @pytest.mark.slow
-def test_many_gaps_are_counted_in_one_line(caplog: pytest.LogCaptureFixture) -> None:
+def test_many_gaps_are_counted_in_one_line(caplog: pytest.LogCaptureFixture):
     bad = range(6, FRAMES - 1, 3)
     run(black, bad, "mapping.enabled=false")
     first = ", ".join(map(str, bad[:10]))
@@ -239,7 +239,7 @@ def test_many_gaps_are_counted_in_one_line(caplog: pytest.LogCaptureFixture) -> 
     assert caplog.text.count("interpolated") == 1
 
 
-def test_an_undamaged_drive_has_no_interpolated_frames(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_undamaged_drive_has_no_interpolated_frames(caplog: pytest.LogCaptureFixture):
     assert (result := run(black, range(0), "mapping.enabled=false")).drive.interpolated == {}
     assert result.drive.doubled == [] and "exposure" not in caplog.text
 
@@ -254,7 +254,7 @@ def observe(frames: int, damage: Damage, bad: range, *overrides: str) -> Measure
         return observer.finish()
 
 
-def test_missing_images_never_end_a_run_and_unreadable_ones_do() -> None:
+def test_missing_images_never_end_a_run_and_unreadable_ones_do():
     """Thirty-four missing in a row are a gap in time; the thirty-first unreadable one is an error."""
     assert sorted(observe(FRAMES, missing, range(4, 38)).unusable) == list(range(4, 38))
     assert sorted(observe(34, unreadable, range(4, 38)).unusable) == list(range(4, 34))
@@ -262,18 +262,18 @@ def test_missing_images_never_end_a_run_and_unreadable_ones_do() -> None:
         observe(35, unreadable, range(4, 38))
 
 
-def test_a_missing_image_is_an_error_where_gaps_are_switched_off() -> None:
+def test_a_missing_image_is_an_error_where_gaps_are_switched_off():
     with pytest.raises(MissingFrameError, match=r"there is no image 8\.png"):
         observe(20, missing, range(8, 10), "gaps.enabled=false")
 
 
-def test_an_unreadable_image_raises_its_error_where_gaps_are_switched_off() -> None:
+def test_an_unreadable_image_raises_its_error_where_gaps_are_switched_off():
     with pytest.raises(SequenceError, match=r"image 15\.png is truncated"):
         run(unreadable, BAD, "gaps.enabled=false")
 
 
 @pytest.mark.parametrize("stride", [pytest.param(1, marks=pytest.mark.slow), 2])
-def test_flushing_after_each_frame_measures_the_same_as_going_on(stride: int) -> None:
+def test_flushing_after_each_frame_measures_the_same_as_going_on(stride: int):
     sequence = Damaged(street(), black, range(12, 14))
     config = config_with("mapping.enabled=false", f"depth.frame_stride={stride}")
     going_on, flushed = (
@@ -318,7 +318,7 @@ def assert_same(one: Observer, other: Observer) -> None:
 @pytest.mark.slow
 def test_a_camera_that_moves_too_little_to_be_told_from_the_frame_before_does_not_stand(
     monkeypatch: pytest.MonkeyPatch,
-) -> None:
+):
     """It is compared with the last frame from which it can be told apart."""
 
     def crawling(*args: Any) -> Route:
@@ -354,7 +354,7 @@ def test_a_camera_that_moves_too_little_to_be_told_from_the_frame_before_does_no
     assert still.issuperset(range(FRAMES + LONGEST_STEP + 1, 2 * FRAMES))
 
 
-def test_the_threads_of_an_observer_end_with_it() -> None:
+def test_the_threads_of_an_observer_end_with_it():
     sequence = Damaged(street(), black, range(0))
     before = set(threading.enumerate())
     with Observer(oracle_of(sequence), sequence.intrinsics, config_with(), Stopwatch()) as observer:
@@ -367,7 +367,7 @@ def test_the_threads_of_an_observer_end_with_it() -> None:
     assert set(threading.enumerate()) <= before
 
 
-def test_a_given_mask_holds_until_one_is_found() -> None:
+def test_a_given_mask_holds_until_one_is_found():
     sequence = street()
     given, found = np.zeros(sequence.frame(0).grey.shape, bool), np.zeros((2, 4), bool)
     given[-4:], found[:, 0] = True, True

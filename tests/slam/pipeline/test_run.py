@@ -121,7 +121,7 @@ def ate(estimate: Trajectory, reference: Trajectory | None) -> float:
     return float(trajectory_metrics(estimate, reference).align.dof7.ate_rmse_m)
 
 
-def test_exact_predictions_give_the_true_trajectory() -> None:
+def test_exact_predictions_give_the_true_trajectory():
     drive = LevelRoad(turning(60))
     result = run(drive)
     for each in (result.network, result.odometry, result.optimised, result.reference):
@@ -149,7 +149,7 @@ class OneBadSnippet(OraclePredictor):
         )
 
 
-def test_a_pose_that_is_no_number_costs_a_gap() -> None:
+def test_a_pose_that_is_no_number_costs_a_gap():
     drive = LevelRoad(turning(60))
     oracle = OneBadSnippet(drive.reference, road, NO_NOISE, FACTOR)
     result = SlamPipeline(drive, oracle, load_config(None, NO_IMAGES)).run()
@@ -157,7 +157,7 @@ def test_a_pose_that_is_no_number_costs_a_gap() -> None:
     assert ate(result.optimised, result.reference) < 0.1
 
 
-def test_a_step_that_no_camera_makes_begins_a_segment(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_that_no_camera_makes_begins_a_segment(monkeypatch: pytest.MonkeyPatch):
     truth, solve = room.walk(30), PoseGraph.optimise
     drive = LevelRoad(truth)
     drive.intrinsics, drive.camera_height_m = room.INTRINSICS, None
@@ -176,9 +176,7 @@ def test_a_step_that_no_camera_makes_begins_a_segment(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("stage", ["close_loops", "PoseGraph"])
-def test_an_error_in_loops_or_graph_costs_these(
-    stage: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_error_in_loops_or_graph_costs_these(stage: str, monkeypatch: pytest.MonkeyPatch):
     def failing(*_: object) -> None:
         raise KeyError(7)
 
@@ -204,7 +202,7 @@ def test_an_error_in_loops_or_graph_costs_these(
         pipeline.run()
 
 
-def test_scale_drift_is_corrected_by_the_ground_plane() -> None:
+def test_scale_drift_is_corrected_by_the_ground_plane():
     noise = OracleNoise(scale_drift_sigma=0.03)
     result = run(LevelRoad(turning(120)), noise=noise)
     drifted = result.network.length_m / FACTOR / turning_length(120)
@@ -221,7 +219,7 @@ def turning_length(frames: int) -> float:
     ("mode", "unit_m"),
     [("none", HEIGHT_M), ("camera-height", 1.0), ("reference", 1.0), ("auto", 1.0)],
 )
-def test_scale_modes(mode: str, unit_m: float) -> None:
+def test_scale_modes(mode: str, unit_m: float):
     """``none`` measures in camera heights, the others in metres."""
     result = run(LevelRoad(turning(30)), f"scale.mode={mode}")
     assert result.scale.mode == ("camera-height" if mode == "auto" else mode)
@@ -242,7 +240,7 @@ def test_scale_modes(mode: str, unit_m: float) -> None:
 )
 def test_what_cannot_work_is_refused_before_any_frame_is_read(
     frames: int, setting: str, words: str
-) -> None:
+):
     drive = LevelRoad(turning(frames))
     oracle = OraclePredictor(turning(frames), road)
     drive.reference = drive.camera_height_m = None
@@ -254,7 +252,7 @@ def test_what_cannot_work_is_refused_before_any_frame_is_read(
     assert drive.frames_read == 0
 
 
-def test_lidar_factors_need_metres() -> None:
+def test_lidar_factors_need_metres():
     drive = LevelRoad(turning(30))
     drive.camera_height_m, drive.T_camera_lidar = None, np.eye(4)
     pipeline = SlamPipeline(
@@ -266,12 +264,12 @@ def test_lidar_factors_need_metres() -> None:
         pipeline.require_possible()
 
 
-def test_one_snippet_is_enough() -> None:
+def test_one_snippet_is_enough():
     result = run(LevelRoad(turning(5)))
     np.testing.assert_allclose(result.optimised.T_world_camera, turning(5), atol=1e-3)
 
 
-def test_without_a_ground_plane_lengths_stay_unscaled_with_a_reason() -> None:
+def test_without_a_ground_plane_lengths_stay_unscaled_with_a_reason():
     result = run(LevelRoad(turning(20)), depth_of=lambda index: np.full((32, 104), 10.0))
     assert isinstance(result.scale.estimate, Failed) and "0 frames" in result.scale.estimate.reason
     np.testing.assert_array_equal(result.scale.per_frame, 1.0)
@@ -285,7 +283,7 @@ def threads(before: Collection[threading.Thread]) -> set[str]:
     return {thread.name for thread in alive if thread.name.startswith(prefixes)}
 
 
-def test_threads_end_where_a_run_fails() -> None:
+def test_threads_end_where_a_run_fails():
     """The depth of one frame cannot be computed: the error is the run's, and nothing goes on in the background."""
 
     def fails(index: int) -> FloatArray:
@@ -305,7 +303,7 @@ def speckled() -> Image:
 
 
 @pytest.mark.parametrize("mode", ["camera-height", "reference"])
-def test_a_standing_camera_stays_at_the_origin(mode: str) -> None:
+def test_a_standing_camera_stays_at_the_origin(mode: str):
     still = LevelRoad(np.tile(np.eye(4), (40, 1, 1)), speckled())
     result = run(still, f"scale.mode={mode}")
     np.testing.assert_allclose(result.optimised.T_world_camera, still.reference, atol=1e-9)
@@ -316,7 +314,7 @@ def test_a_standing_camera_stays_at_the_origin(mode: str) -> None:
         )
 
 
-def test_zero_optical_flow_suppresses_the_noise_of_the_pose_network() -> None:
+def test_zero_optical_flow_suppresses_the_noise_of_the_pose_network():
     still = LevelRoad(np.tile(np.eye(4), (40, 1, 1)), speckled())
     noise = OracleNoise(np.deg2rad(0.3))
     options = ("visual_odometry.enabled=true",)
@@ -330,7 +328,7 @@ def test_zero_optical_flow_suppresses_the_noise_of_the_pose_network() -> None:
     np.testing.assert_array_equal(result.odometry.T_world_camera, still.reference)
 
 
-def test_images_without_corners_leave_only_network_factors() -> None:
+def test_images_without_corners_leave_only_network_factors():
     result = run(LevelRoad(turning(20)), "visual_odometry.enabled=true")
     assert len(result.drive.steps) == 0
     assert [*result.drive.measured.failures] == [(k, k + 1) for k in range(19)]
@@ -370,7 +368,7 @@ def driven(street: SimulatedSequence) -> tuple[Estimate, list[tuple[str, int, in
 
 def test_two_runs_write_the_same_bytes(
     street: SimulatedSequence, driven: tuple[Estimate, list[tuple[str, int, int]]], tmp_path: Path
-) -> None:
+):
     """Corner detection, RANSAC and the threads of GTSAM and Open3D must not change the result."""
     for name, result in (("first", driven[0]), ("second", drive_street(street))):
         folder = tmp_path / name
@@ -385,9 +383,7 @@ def test_two_runs_write_the_same_bytes(
         assert path.read_bytes() == (tmp_path / "second" / path.name).read_bytes(), path.name
 
 
-def test_images_reach_geometry_map_and_report(
-    driven: tuple[Estimate, list[tuple[str, int, int]]],
-) -> None:
+def test_images_reach_geometry_map_and_report(driven: tuple[Estimate, list[tuple[str, int, int]]]):
     result, calls = driven
     solved = [("loops and graph", k, 1) for k in range(2)]
     assert calls == [("frames", k, STREET) for k in range(1, STREET + 1)] + solved + [
@@ -407,7 +403,7 @@ def test_images_reach_geometry_map_and_report(
 
 
 @pytest.mark.slow
-def test_without_metres_the_map_is_as_fine_as_the_scene_is_near(street: SimulatedSequence) -> None:
+def test_without_metres_the_map_is_as_fine_as_the_scene_is_near(street: SimulatedSequence):
     """In camera heights, which are no metres; depth of the sky is unknown."""
     result = drive_street(street, mode="none", sky=np.nan)
     depths = [street.true_depth(k) for k in range(0, STREET, 6)]
@@ -416,9 +412,7 @@ def test_without_metres_the_map_is_as_fine_as_the_scene_is_near(street: Simulate
     assert result.map.statistics()["triangles"] > 5000
 
 
-def test_depth_is_thinned_for_the_map(
-    street: SimulatedSequence, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_depth_is_thinned_for_the_map(street: SimulatedSequence, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(measured, "MAP_WIDTH_PX", 104)
     oracle = OraclePredictor(street.reference, lambda k: np.full((64, 208), 10.0))
     settings = load_config(None, ["visual_odometry.enabled=false"])
@@ -465,7 +459,7 @@ def worst(result: Estimate) -> float:
     return float(np.linalg.norm(result.optimised.positions - path()[:, :3, 3], axis=1).max())
 
 
-def test_exact_fixes_give_scale_and_place() -> None:
+def test_exact_fixes_give_scale_and_place():
     result = located(
         track(np.random.default_rng(0), 0.0), "gps.sigma_m=0.1", "gps.vertical_sigma_m=0.1"
     )
@@ -485,7 +479,7 @@ def test_exact_fixes_give_scale_and_place() -> None:
 
 
 @pytest.mark.parametrize("correlation_s", [0, pytest.param(10, marks=pytest.mark.slow)])
-def test_gps_holds_a_drifting_odometry_despite_outliers(correlation_s: int) -> None:
+def test_gps_holds_a_drifting_odometry_despite_outliers(correlation_s: int):
     noise = OracleNoise(np.deg2rad(0.3), 0.05, seed=1)
     gps = track(np.random.default_rng(1), 0.5, outliers=8)
     settings = ("gps.sigma_m=0.5", "gps.vertical_sigma_m=0.5", f"gps.correlation_s={correlation_s}")
@@ -501,7 +495,7 @@ def test_gps_holds_a_drifting_odometry_despite_outliers(correlation_s: int) -> N
     assert errors[1] < 0.45 and 2 * errors[1] < errors[0]
 
 
-def test_a_track_that_does_not_fit_is_refused() -> None:
+def test_a_track_that_does_not_fit_is_refused():
     gps = track(np.random.default_rng(0), 0.0)
     with pytest.raises(SlamError, match=r"0 GPS fixes .* set gps\.offset_s"):
         located(gps, "gps.offset_s=100")
@@ -514,7 +508,7 @@ def test_a_track_that_does_not_fit_is_refused() -> None:
 @pytest.mark.parametrize("change", ["backwards", pytest.param("late", marks=pytest.mark.slow)])
 def test_fixes_of_another_drive_are_left_out_or_refused(
     change: str, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     gps = track(np.random.default_rng(0), 0.0)
     places = gps.places[::-1] if change == "backwards" else np.roll(gps.places, 30, axis=0)
     other = GpsTrack(gps.stamps, places, gps.dilution, gps.speeds)
@@ -527,7 +521,7 @@ def test_fixes_of_another_drive_are_left_out_or_refused(
         located(other, *settings, "scale.mode=gps")
 
 
-def test_a_camera_that_stands_is_not_located() -> None:
+def test_a_camera_that_stands_is_not_located():
     gps = track(np.random.default_rng(0), 0.0)
     result = located(
         GpsTrack(gps.stamps, np.tile(PLACE, (len(gps.stamps), 1)), gps.dilution, gps.speeds)
@@ -536,9 +530,7 @@ def test_a_camera_that_stands_is_not_located() -> None:
     assert isinstance(result.scale.estimate, Failed)
 
 
-def test_fixes_in_metres_are_no_factors_of_lengths_that_are_not(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_fixes_in_metres_are_no_factors_of_lengths_that_are_not(caplog: pytest.LogCaptureFixture):
     """Long enough for the heading, too short for the scale."""
     gps = track(np.random.default_rng(0), 0.0)
     result = located(gps, "gps.sigma_m=5", "gps.correlation_s=0")
@@ -549,7 +541,7 @@ def test_fixes_in_metres_are_no_factors_of_lengths_that_are_not(
 
 
 @pytest.mark.parametrize("ends", ["[20,80]", "[8.04s,20]"])
-def test_a_known_distance_gives_metres(ends: str) -> None:
+def test_a_known_distance_gives_metres(ends: str):
     apart = float(np.linalg.norm(path()[80, :3, 3] - path()[20, :3, 3]))
     result = located(
         None, "scale.mode=known", f"scale.known_m={apart}", f"scale.known_between={ends}"
@@ -565,12 +557,12 @@ def test_a_known_distance_gives_metres(ends: str) -> None:
         ("[30s,5]", "names 30s"),
     ],
 )
-def test_a_distance_between_frames_that_are_not_there(setting: str, said: str) -> None:
+def test_a_distance_between_frames_that_are_not_there(setting: str, said: str):
     with pytest.raises(SlamError, match=said):
         located(None, "scale.mode=known", "scale.known_m=3", f"scale.known_between={setting}")
 
 
-def test_a_known_distance_needs_both_settings() -> None:
+def test_a_known_distance_needs_both_settings():
     for overrides in (
         ["scale.known_m=3"],
         ["scale.known_between=[1,2]"],

@@ -28,7 +28,7 @@ def frames(first: int, count: int = 5) -> list[Frame]:
     ]
 
 
-def test_outputs_by_frame_are_those_of_the_networks_by_image(direct: DepthPosePredictor) -> None:
+def test_outputs_by_frame_are_those_of_the_networks_by_image(direct: DepthPosePredictor):
     predictor: Predictor = NetworkPredictor(direct, CAMERA)
     snippet = frames(10)
     depth = predictor.depth(snippet[0])
@@ -41,7 +41,7 @@ def test_outputs_by_frame_are_those_of_the_networks_by_image(direct: DepthPosePr
     )
 
 
-def test_depth_and_preparation_are_computed_once_a_frame(direct: DepthPosePredictor) -> None:
+def test_depth_and_preparation_are_computed_once_a_frame(direct: DepthPosePredictor):
     asked: list[object] = []
     prepared: list[Image] = []
 

@@ -100,7 +100,7 @@ def shifts(snippet: SnippetPoses) -> np.ndarray:
 
 
 @pytest.mark.parametrize("gain", [0.02, 1.0, 40.0])
-def test_poses_get_the_unit_of_a_source_with_one_unit(gain: float) -> None:
+def test_poses_get_the_unit_of_a_source_with_one_unit(gain: float):
     both = predictor(Source(gain))
     np.testing.assert_allclose(both.depth(frames()[0]), 1 / (gain * SCENE), rtol=1e-5)
     snippet = both.snippet(frames())
@@ -110,24 +110,20 @@ def test_poses_get_the_unit_of_a_source_with_one_unit(gain: float) -> None:
 
 
 @pytest.mark.parametrize(("align", "shift"), [("scale", 0.0), ("affine", 0.3), ("affine", -0.04)])
-def test_each_frame_is_aligned_to_the_networks(
-    align: Literal["scale", "affine"], shift: float
-) -> None:
+def test_each_frame_is_aligned_to_the_networks(align: Literal["scale", "affine"], shift: float):
     both = predictor(Source(7.0, shift), align)
     np.testing.assert_allclose(both.depth(frames()[0]), 1 / SCENE, rtol=1e-3)
     np.testing.assert_array_equal(shifts(both.snippet(frames())), 1.0)
 
 
-def test_an_alignment_that_would_turn_near_into_far_is_a_scale() -> None:
+def test_an_alignment_that_would_turn_near_into_far_is_a_scale():
     upside_down = Source(-1.0, 1.2)
     depth = predictor(upside_down, "affine").depth(frames()[0])
     known = np.isfinite(depth)
     assert known.all() and (depth > 0).all() and depth[0, 0] < depth[-1, 0]
 
 
-def test_the_unit_of_a_frame_without_depth_is_that_of_the_nearest(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_the_unit_of_a_frame_without_depth_is_that_of_the_nearest(caplog: pytest.LogCaptureFixture):
     both = predictor(Source(0.5, unknown=(1, 2, 3)))
     with caplog.at_level(logging.WARNING):
         assert np.isnan(both.depth(frames()[2])).all()
@@ -137,9 +133,7 @@ def test_the_unit_of_a_frame_without_depth_is_that_of_the_nearest(
 
 
 @pytest.mark.parametrize("size", [(HEIGHT, WIDTH), (10, 24), (80, 192), (20, 190)])
-def test_depth_of_any_size_is_resized_and_unknown_pixels_do_not_spread(
-    size: tuple[int, int],
-) -> None:
+def test_depth_of_any_size_is_resized_and_unknown_pixels_do_not_spread(size: tuple[int, int]):
     rows = (np.arange(size[0]) + 0.5) / size[0]
     plane = np.tile((0.1 + 0.9 * rows)[:, None], (1, size[1])).astype(np.float32)
     wanted = np.tile((0.1 + 0.9 * (np.arange(HEIGHT) + 0.5) / HEIGHT)[:, None], (1, WIDTH))
@@ -171,13 +165,13 @@ def metres(source: DepthFolder, index: int) -> float:
 
 
 @pytest.mark.parametrize("first", [0, 1, 100])
-def test_files_belong_to_frames_in_the_order_of_their_numbers(tmp_path: Path, first: int) -> None:
+def test_files_belong_to_frames_in_the_order_of_their_numbers(tmp_path: Path, first: int):
     folder = folder_of(tmp_path, [f"depth_{first + k}.npy" for k in range(12)])  # 9 before 10
     source = opened(folder, FrameNumbers(12, 0, 12))
     assert [metres(source, k) for k in range(12)] == pytest.approx(range(1, 13))
 
 
-def test_a_range_of_frames_takes_its_own_files_of_the_whole_sequence(tmp_path: Path) -> None:
+def test_a_range_of_frames_takes_its_own_files_of_the_whole_sequence(tmp_path: Path):
     folder = folder_of(tmp_path, [f"{k:06d}.npy" for k in range(10)])
     assert metres(opened(folder, FrameNumbers(4, 5, 10)), 0) == pytest.approx(6)
     assert metres(opened(folder, FrameNumbers(10, 300, 400)), 0) == pytest.approx(1), (
@@ -185,7 +179,7 @@ def test_a_range_of_frames_takes_its_own_files_of_the_whole_sequence(tmp_path: P
     )
 
 
-def test_a_missing_number_is_an_error_only_if_its_frame_is_there(tmp_path: Path) -> None:
+def test_a_missing_number_is_an_error_only_if_its_frame_is_there(tmp_path: Path):
     names = [f"{k:06d}.npy" for k in range(8)]
     folder = folder_of(tmp_path, names)
     (folder / names[3]).unlink()
@@ -198,7 +192,7 @@ def test_a_missing_number_is_an_error_only_if_its_frame_is_there(tmp_path: Path)
 @pytest.mark.parametrize(("scale", "value"), [(256.0, 10.0), (1000.0, 2.56)])
 def test_pictures_of_16_bits_have_a_scale_and_zero_is_unknown(
     tmp_path: Path, scale: float, value: float
-) -> None:
+):
     picture = np.full((HEIGHT, WIDTH), 2560, np.uint16)
     picture[0, 0] = 0
     cv2.imwrite(str(tmp_path / "000000.png"), picture)
@@ -208,14 +202,14 @@ def test_pictures_of_16_bits_have_a_scale_and_zero_is_unknown(
     assert np.isnan(disparity[0, 0]) and disparity[5, 5] == pytest.approx(1 / value)
 
 
-def test_disparity_may_be_given_and_axes_of_length_one_do_not_matter(tmp_path: Path) -> None:
+def test_disparity_may_be_given_and_axes_of_length_one_do_not_matter(tmp_path: Path):
     np.save(tmp_path / "0.npy", np.full((1, HEIGHT, WIDTH, 1), 0.125, np.float16))
     source = opened(tmp_path, FrameNumbers(1, 0, 1), kind="disparity")
     disparity = source.disparity(*frames(0, 1))
     assert disparity.shape == (HEIGHT, WIDTH) and (disparity == 0.125).all()
 
 
-def test_the_digest_is_of_names_and_content(tmp_path: Path) -> None:
+def test_the_digest_is_of_names_and_content(tmp_path: Path):
     numbers = FrameNumbers(3, 0, 3)
     first = opened(folder_of(tmp_path / "a", ["0.npy", "1.npy", "2.npy"]), numbers).sha256
     copy = folder_of(tmp_path / "b", ["0.npy", "1.npy", "2.npy"])
@@ -275,7 +269,7 @@ def image(value: int = 51, height: int = 16, width: int = 32) -> Image:
     return np.full((height, width, 3), value, np.uint8)
 
 
-def test_mean_and_deviation_of_each_channel(make_network: MakeNetwork) -> None:
+def test_mean_and_deviation_of_each_channel(make_network: MakeNetwork):
     source = opened_onnx(make_network(), mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225))
     pixel = np.array([100, 150, 200], np.uint8)
     wanted = ((pixel / 255 - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]).mean()
@@ -284,7 +278,7 @@ def test_mean_and_deviation_of_each_channel(make_network: MakeNetwork) -> None:
 
 def test_depth_and_disparity_are_told_apart_and_unknown_pixels_stay_unknown(
     make_network: MakeNetwork,
-) -> None:
+):
     frame = Frame(0, 0.0, np.concatenate([image(0), image(255)], axis=1)[:, ::2].copy())
     path = make_network(gain=2.0)
     far, near = opened_onnx(path, kind="disparity").disparity(frame)[0, [0, -1]]
@@ -295,7 +289,7 @@ def test_depth_and_disparity_are_told_apart_and_unknown_pixels_stay_unknown(
         assert np.isnan(opened_onnx(make_network("bad.onnx", shift=shift)).disparity(frame)).all()
 
 
-def test_a_network_that_fails_or_gives_no_map_is_found_at_once(make_network: MakeNetwork) -> None:
+def test_a_network_that_fails_or_gives_no_map_is_found_at_once(make_network: MakeNetwork):
     path = make_network(shape=(1, 3, "height", "width"))
     model = onnx.load(path)
     shape = helper.make_tensor("shape", TensorProto.INT64, [3], [2, 14, 14])
@@ -312,7 +306,7 @@ def test_a_network_that_fails_or_gives_no_map_is_found_at_once(make_network: Mak
         opened_onnx(path, size=(14, 28))
 
 
-def test_the_size_is_that_of_the_file_or_is_set(make_network: MakeNetwork) -> None:
+def test_the_size_is_that_of_the_file_or_is_set(make_network: MakeNetwork):
     with pytest.raises(SlamError, match=r"any size: set depth\.size=\[HEIGHT,WIDTH\]"):
         opened_onnx(make_network(shape=(1, 3, "height", "width")))
     assert opened_onnx(make_network(), size=(16, 32)).disparity(Frame(0, 0.0, image())).shape == (
@@ -325,7 +319,7 @@ def test_the_size_is_that_of_the_file_or_is_set(make_network: MakeNetwork) -> No
         opened_onnx(make_network(), size=(14, 28))
 
 
-def test_weights_in_other_files_are_refused(make_network: MakeNetwork, tmp_path: Path) -> None:
+def test_weights_in_other_files_are_refused(make_network: MakeNetwork, tmp_path: Path):
     model = onnx.load(make_network())
     for tensor in model.graph.initializer:
         tensor.raw_data = np.float32(1).tobytes()
@@ -389,7 +383,7 @@ def run(world: Path, output: Path, source: str, *overrides: str, **options: Any)
 
 def test_our_exported_network_gives_the_run_of_our_weights(
     world: Path, tiny_weights: Path, exported: Path, tmp_path: Path, check_run: CheckRun
-) -> None:
+):
     options = {"weights": tiny_weights, "frames": "0:9"}
     own = run(world, tmp_path / "own", "network", "output.report=true", **options)
     other = run(world, tmp_path / "other", f"onnx:{exported}", "output.report=true", **options)
@@ -407,7 +401,7 @@ def test_our_exported_network_gives_the_run_of_our_weights(
 
 def test_exact_depth_gives_a_run_of_the_right_scale_in_any_unit(
     world: Path, arrays: Path, tmp_path: Path
-) -> None:
+):
     pictures = run(world, tmp_path / "png", f"png:{exact(world)}")
     metrics = pictures.metrics().tree()
     assert metrics["scale"]["value"] == pytest.approx(1.0, abs=0.06)
@@ -426,7 +420,7 @@ def test_exact_depth_gives_a_run_of_the_right_scale_in_any_unit(
 
 def test_a_range_of_frames_and_a_blank_one(
     world: Path, arrays: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     folder = shutil.copytree(arrays, tmp_path / "arrays")
     np.save(folder / "000012.npy", np.full((48, 156), np.nan, np.float32))
     metrics = run(world, tmp_path / "run", f"npy:{folder}", frames="6:18").metrics().tree()
@@ -434,7 +428,7 @@ def test_a_range_of_frames_and_a_blank_one(
     assert metrics["scale"]["value"] == pytest.approx(1 / 3, rel=0.06)
 
 
-def test_depth_of_distorted_images_is_undistorted_with_them(world: Path, tmp_path: Path) -> None:
+def test_depth_of_distorted_images_is_undistorted_with_them(world: Path, tmp_path: Path):
     depth, camera = exact(world) / "000000.png", tmp_path / "camera.yaml"
     camera.write_text(
         "width: 312\nheight: 96\nfx: 180\nfy: 180\ncx: 155\ncy: 45\nfps: 10\n"
@@ -464,7 +458,7 @@ def test_depth_of_distorted_images_is_undistorted_with_them(world: Path, tmp_pat
     )
 
 
-def test_a_relative_network_is_aligned_in_each_frame(world: Path, tmp_path: Path) -> None:
+def test_a_relative_network_is_aligned_in_each_frame(world: Path, tmp_path: Path):
     folder = tmp_path / "relative"
     folder.mkdir()
     rng = np.random.default_rng(0)
@@ -484,7 +478,7 @@ def test_a_relative_network_is_aligned_in_each_frame(world: Path, tmp_path: Path
 
 def test_live_sessions_take_a_network_and_refuse_folders(
     world: Path, tiny_weights: Path, exported: Path, arrays: Path
-) -> None:
+):
     sequence = open_sequence(world, "sim")
     config = load_config(None, [f"depth.source=onnx:{exported}"])
     with Slam.from_weights(
@@ -519,7 +513,7 @@ def test_bad_sources_are_one_line_and_exit_1(
     command_line: Callable[..., tuple[int, str, str]],
     source: str,
     message: str,
-) -> None:
+):
     monkeypatch.chdir(tmp_path)
     (shutil.copytree(arrays, tmp_path / "short") / "000017.npy").unlink()
     np.save(

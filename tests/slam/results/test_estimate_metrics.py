@@ -39,7 +39,7 @@ def factors(student_t_dof: float) -> list[RelativePose]:
 
 
 @pytest.mark.parametrize("student_t_dof", [math.inf, 12.0, 4.0])
-def test_noise_with_the_stated_sigmas_is_covered(student_t_dof: float) -> None:
+def test_noise_with_the_stated_sigmas_is_covered(student_t_dof: float):
     ratios = coverage(factors(student_t_dof), truth(), 1.0)[""]
     assert ratios == {
         "50": pytest.approx(0.5, abs=0.03),
@@ -48,14 +48,14 @@ def test_noise_with_the_stated_sigmas_is_covered(student_t_dof: float) -> None:
     }
 
 
-def test_bounds_by_hand() -> None:
+def test_bounds_by_hand():
     assert squared_bound(0.95, math.inf) == pytest.approx(12.592, abs=1e-3)
     # the 50 % quantile of F(6, 6) is 1; four of six degrees of freedom are left of the variance
     assert squared_bound(0.5, 6.0) == pytest.approx(6 * 4 / 6)
     assert squared_bound(0.9, 1e6) == pytest.approx(squared_bound(0.9, math.inf), rel=1e-4)
 
 
-def test_the_scale_is_known() -> None:
+def test_the_scale_is_known():
     edges, metric = factors(math.inf), truth()
     ratios = coverage(edges, metric, 1.0)
     metric[:, :3, 3] *= 4.0
@@ -63,7 +63,7 @@ def test_the_scale_is_known() -> None:
     assert coverage(edges, metric, 1.0)[""]["95"] < 0.1
 
 
-def test_overconfident_factors_are_found_by_source() -> None:
+def test_overconfident_factors_are_found_by_source():
     honest = factors(math.inf)
     boasting = [replace(f, sigmas=f.sigmas / 10, source=LOOP_SOURCE) for f in honest[:100]]
     kinds = coverage(honest + boasting, truth(), 1.0)
@@ -81,7 +81,7 @@ def test_overconfident_factors_are_found_by_source() -> None:
 
 @pytest.mark.data
 @pytest.mark.slow
-def test_the_recorded_track_of_a_drive(data_root: Path, tmp_path: Path) -> None:
+def test_the_recorded_track_of_a_drive(data_root: Path, tmp_path: Path):
     """Fixes with 0.2 m of noise added give a metric scale without the road, and hold the heading."""
     drive = data_root / DRIVE
     begin = np.datetime64((drive / "image_02/timestamps.txt").read_text().split("\n")[0], "ns")

@@ -19,12 +19,12 @@ MakeRun = Callable[..., RunFolder]
 LOGGER = logging.getLogger("slam.test")
 
 
-def test_a_folder_that_is_not_there_is_said(tmp_path: Path) -> None:
+def test_a_folder_that_is_not_there_is_said(tmp_path: Path):
     with pytest.raises(RunError, match="nowhere is not there"):
         RunFolder(tmp_path / "nowhere")
 
 
-def test_new_folders_carry_the_sequence_and_latest_points_to_the_newest(tmp_path: Path) -> None:
+def test_new_folders_carry_the_sequence_and_latest_points_to_the_newest(tmp_path: Path):
     first = RunFolder.create(None, tmp_path / "results", "sim/loop 42")
     second = RunFolder.create(None, tmp_path / "results", "sim/loop 42")
     assert first.path != second.path
@@ -45,14 +45,14 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
 
 
-def test_a_new_run_replaces_the_files_of_an_earlier_one_alone(make_run: MakeRun) -> None:
+def test_a_new_run_replaces_the_files_of_an_earlier_one_alone(make_run: MakeRun):
     old = make_run("mine").path
     (old / "notes.txt").write_text("what I saw")
     assert begin(old).path == old
     assert {path.name for path in old.iterdir()} == {"metrics.json", "notes.txt"}
 
 
-def test_what_a_killed_run_was_writing_goes_with_it(tmp_path: Path) -> None:
+def test_what_a_killed_run_was_writing_goes_with_it(tmp_path: Path):
     begin(tmp_path / "mine")
     (tmp_path / "mine" / ".12.34.partial.map_mesh.ply").write_text("ply")
     (tmp_path / "mine" / ".12.34.partial.thesis.tex").write_text("of somebody else")
@@ -61,7 +61,7 @@ def test_what_a_killed_run_was_writing_goes_with_it(tmp_path: Path) -> None:
     assert [path.name for path in new.path.iterdir()] == [".12.34.partial.thesis.tex"]
 
 
-def test_runs_that_begin_in_the_same_second_get_a_folder_each(tmp_path: Path) -> None:
+def test_runs_that_begin_in_the_same_second_get_a_folder_each(tmp_path: Path):
     with ThreadPoolExecutor(8) as pool:
         folders = list(pool.map(lambda _: RunFolder.create(None, tmp_path, "sim").path, range(32)))
     assert len(set(folders)) == 32 and all(path.is_dir() for path in folders)
@@ -75,7 +75,7 @@ def test_runs_that_begin_in_the_same_second_get_a_folder_each(tmp_path: Path) ->
         ("metrics.json", '{"schema": 1, "status": "ok", "provenance": {"tool": "another"}}'),
     ],
 )
-def test_files_of_other_programs_are_not_replaced(tmp_path: Path, name: str, text: str) -> None:
+def test_files_of_other_programs_are_not_replaced(tmp_path: Path, name: str, text: str):
     (tmp_path / name).write_text(text)
     with pytest.raises(
         RunError, match=r"not empty and holds no run of erfsfm-slam: choose another --output"
@@ -86,7 +86,7 @@ def test_files_of_other_programs_are_not_replaced(tmp_path: Path, name: str, tex
 
 def test_a_run_that_did_not_end_is_opened_with_one_note(
     make_run: MakeRun, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     folder = make_run()
     RunFolder.open(folder.path)
     assert caplog.records == []
@@ -109,7 +109,7 @@ def test_a_run_that_did_not_end_is_opened_with_one_note(
     "reason",
     ["the map is empty: no depth passed the filters", "fusion is switched off (mapping.enabled)"],
 )
-def test_a_missing_map_is_explained_by_the_run(make_run: MakeRun, reason: str) -> None:
+def test_a_missing_map_is_explained_by_the_run(make_run: MakeRun, reason: str):
     folder = make_run()
     (folder.path / "map_mesh.ply").unlink()
     folder.write_metrics(folder.metrics().changed(map=MapMetrics.unknown(reason)))
@@ -124,7 +124,7 @@ def test_a_missing_map_is_explained_by_the_run(make_run: MakeRun, reason: str) -
         folder.require("map_mesh.ply")
 
 
-def test_a_run_opens_by_its_name_and_shows_itself(make_run: MakeRun) -> None:
+def test_a_run_opens_by_its_name_and_shows_itself(make_run: MakeRun):
     path = make_run("mine").path
     run = slam.RunFolder(str(path))
     assert run.path == path and len(run.mesh().vertices) == 3
@@ -137,7 +137,7 @@ def test_a_run_opens_by_its_name_and_shows_itself(make_run: MakeRun) -> None:
 
 def test_lines_from_before_the_folder_are_kept_and_failures_are_written_here_alone(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     with run_log() as log:
         LOGGER.info("checked")
         log.begin(tmp_path / "run.log")
@@ -157,7 +157,7 @@ def test_lines_from_before_the_folder_are_kept_and_failures_are_written_here_alo
 
 def test_a_trajectory_by_a_name_that_there_is_not_is_told_which_there_are(
     make_run: Callable[..., RunFolder],
-) -> None:
+):
     with pytest.raises(
         RunError, match=r"trajectory optimized: give reference, network, .*optimised"
     ):

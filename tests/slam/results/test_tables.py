@@ -36,7 +36,7 @@ def side_by_side(runs: list[RunFolder]) -> Table:
 
 def test_runs_are_shown_side_by_side_with_their_numbers(
     make_run: MakeRun, make_metrics: MakeMetrics, printed: Callable[[Table], str]
-) -> None:
+):
     text = printed(side_by_side([make_run("first"), make_run("second", make_metrics(mode="none"))]))
     assert "first" in text and "second" in text
     assert text.count("0.870") == 2  # ATE of the optimised trajectories, 7 dof
@@ -45,7 +45,7 @@ def test_runs_are_shown_side_by_side_with_their_numbers(
 
 def test_a_leak_and_missing_numbers_are_noted(
     make_run: MakeRun, make_metrics: MakeMetrics, printed: Callable[[Table], str]
-) -> None:
+):
     text = printed(side_by_side([make_run("seen", make_metrics(leak=True))]))
     assert "seen, LEAK" in text
     assert (
@@ -61,7 +61,7 @@ def test_a_run_that_did_not_end_has_its_reason(
     printed: Callable[[Table], str],
     status: str,
     word: str,
-) -> None:
+):
     failed = {
         "schema": 1,
         "status": status,
@@ -85,7 +85,7 @@ def errors_of(frames: int) -> TrajectoryMetrics:
     return trajectory_metrics(Trajectory(stamps, T_world_camera), Trajectory(stamps, truth))
 
 
-def test_the_errors_of_a_run_fit_a_terminal(printed: Callable[[Table], str]) -> None:
+def test_the_errors_of_a_run_fit_a_terminal(printed: Callable[[Table], str]):
     errors = errors_of(250)
     lines = printed(
         errors_table({"network": errors, "optimised": errors}, "sim [loop], scale camera-height")
@@ -101,7 +101,7 @@ def test_the_errors_of_a_run_fit_a_terminal(printed: Callable[[Table], str]) -> 
     assert float(row.split()[1]) == pytest.approx(snippets["ate_mean"], abs=1e-4)
 
 
-def test_speeds_are_in_km_h_where_lengths_are_metres() -> None:
+def test_speeds_are_in_km_h_where_lengths_are_metres():
     motion = {"path": 500.0, "mean_speed": 10.0, "top_speed": 15.0, "standing_share": 0.25}
     assert motion_line(Metrics.of(motion=motion)) == (
         "500.0 m, 36.0 km/h on average, 54.0 at most, standing in 25 % of the steps"
@@ -111,7 +111,7 @@ def test_speeds_are_in_km_h_where_lengths_are_metres() -> None:
     assert motion_line(Metrics()) == ""
 
 
-def test_two_files_are_compared_under_every_alignment(printed: Callable[[Table], str]) -> None:
+def test_two_files_are_compared_under_every_alignment(printed: Callable[[Table], str]):
     errors = errors_of(250)
     text = printed(alignments_table(errors))
     for name, values in errors.tree()["align"].items():
@@ -120,7 +120,7 @@ def test_two_files_are_compared_under_every_alignment(printed: Callable[[Table],
         assert len(row) == 1 + len(values)
 
 
-def test_missing_numbers_are_dashes_with_one_reason_each(printed: Callable[[Table], str]) -> None:
+def test_missing_numbers_are_dashes_with_one_reason_each(printed: Callable[[Table], str]):
     text = printed(
         errors_table(
             {

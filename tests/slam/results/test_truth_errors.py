@@ -74,7 +74,7 @@ def errors(
 
 def test_true_depth_at_true_poses_has_no_error(
     embedded: SimulatedSequence, on_disk: Path, true_map: FloatArray
-) -> None:
+):
     exact, measured = errors(true_map, embedded), errors(true_map, open_sequence(on_disk))
     assert (exact["truth"], measured["truth"]) == ("exact surface", "depth maps")
     assert exact["accuracy_90_m"] < 1e-3 and measured["accuracy_90_m"] < 0.04
@@ -84,7 +84,7 @@ def test_true_depth_at_true_poses_has_no_error(
         assert found["evaluated_m"] == pytest.approx(14.8, abs=0.1)
 
 
-def test_scans_are_a_truth(on_disk: Path, true_map: FloatArray) -> None:
+def test_scans_are_a_truth(on_disk: Path, true_map: FloatArray):
     sequence = open_sequence(on_disk)
     assert isinstance(sequence, RecordedSequence)
     sequence.depth_maps = {}
@@ -96,7 +96,7 @@ def test_scans_are_a_truth(on_disk: Path, true_map: FloatArray) -> None:
     assert found["completeness"] > 0.9
 
 
-def test_scans_that_cannot_be_read_measure_nothing(on_disk: Path, true_map: FloatArray) -> None:
+def test_scans_that_cannot_be_read_measure_nothing(on_disk: Path, true_map: FloatArray):
     def cut_off() -> FloatArray:
         raise SequenceError("the scan is cut off")
 
@@ -109,9 +109,7 @@ def test_scans_that_cannot_be_read_measure_nothing(on_disk: Path, true_map: Floa
     assert found["completeness"] is None and found["completeness_reason"]
 
 
-def test_an_excerpt_has_the_truth_of_its_own_frames(
-    embedded: SimulatedSequence, on_disk: Path
-) -> None:
+def test_an_excerpt_has_the_truth_of_its_own_frames(embedded: SimulatedSequence, on_disk: Path):
     for sequence in (embedded.cut(4, 12), open_sequence(on_disk, frames="4:12")):
         camera = sequence.intrinsics
         depth = embedded.true_depth(9)
@@ -120,7 +118,7 @@ def test_an_excerpt_has_the_truth_of_its_own_frames(
         assert found["accuracy_median_m"] < 0.03
 
 
-def test_one_scale_is_fitted_apart(on_disk: Path, true_map: FloatArray) -> None:
+def test_one_scale_is_fitted_apart(on_disk: Path, true_map: FloatArray):
     sequence = open_sequence(on_disk)
     found = errors(true_map, sequence, scale=1.1)
     assert found["accuracy_median_m"] > 0.1
@@ -135,7 +133,7 @@ def test_one_scale_is_fitted_apart(on_disk: Path, true_map: FloatArray) -> None:
     assert unknown["with_scale"]["accuracy_median_m"] < 0.03
 
 
-def test_without_truth_every_number_has_a_reason(on_disk: Path) -> None:
+def test_without_truth_every_number_has_a_reason(on_disk: Path):
     sequence = open_sequence(on_disk)
     assert isinstance(sequence, RecordedSequence)
     sequence.depth_maps, sequence.scans = {}, {}
@@ -151,7 +149,7 @@ def test_without_truth_every_number_has_a_reason(on_disk: Path) -> None:
 
 def test_a_damaged_depth_map_costs_the_error_of_the_map_and_no_more(
     on_disk: Path, true_map: FloatArray
-) -> None:
+):
     sequence = open_sequence(on_disk)
     assert isinstance(sequence, RecordedSequence)
     sequence.depth_maps[3] = partial(read_depth_map, on_disk / "camera.yaml")
@@ -179,7 +177,7 @@ def with_depth(tmp_path: Path) -> RecordedSequence:
     return recorded(depth_maps={2: partial(read_depth_map, path)})
 
 
-def test_stored_depth_is_read_and_compared(tmp_path: Path) -> None:
+def test_stored_depth_is_read_and_compared(tmp_path: Path):
     quality = DepthQuality(with_depth(tmp_path), is_metric=True)
     quality.add(keyframe())
     summary = quality.metrics(is_refined=True).tree()
@@ -188,7 +186,7 @@ def test_stored_depth_is_read_and_compared(tmp_path: Path) -> None:
     assert summary["refined"]["coverage"].keys() == {"50", "90", "95"}
 
 
-def test_an_excerpt_reads_the_frame_of_its_base(tmp_path: Path) -> None:
+def test_an_excerpt_reads_the_frame_of_its_base(tmp_path: Path):
     excerpt = with_depth(tmp_path).cut(2, 4)
     np.testing.assert_allclose(true_depth(excerpt, 0), DEPTH)
     assert true_depth(excerpt, 1) is None
@@ -196,7 +194,7 @@ def test_an_excerpt_reads_the_frame_of_its_base(tmp_path: Path) -> None:
 
 def test_a_depth_map_that_cannot_be_read_is_left_out_with_one_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     sequence = with_depth(tmp_path)
     (tmp_path / "000002.png").write_bytes(b"x")
     quality = DepthQuality(sequence, is_metric=True)
@@ -206,7 +204,7 @@ def test_a_depth_map_that_cannot_be_read_is_left_out_with_one_warning(
     assert len(caplog.messages) == 1 and "000002.png" in caplog.messages[0]
 
 
-def test_every_missing_number_has_its_reason(tmp_path: Path) -> None:
+def test_every_missing_number_has_its_reason(tmp_path: Path):
     def reasons(
         metric: bool, sequence: RecordedSequence, *keyframes: KeyframeDepth, is_refined: bool = True
     ):
@@ -227,6 +225,6 @@ def test_every_missing_number_has_its_reason(tmp_path: Path) -> None:
     assert reasons(True, known, keyframe(False), is_refined=False) == (None, "depth.refine is none")
 
 
-def test_the_nearest_lidar_point_of_a_pixel_counts() -> None:
+def test_the_nearest_lidar_point_of_a_pixel_counts():
     depth = projected(np.array([[0.1, 0.1, 4.0], [0.2, 0.2, 8.0], [0, 0, -3.0]]), np.eye(4), CAMERA)
     assert depth[3, 4] == 4.0 and (depth > 0).sum() == 1

@@ -10,7 +10,7 @@ from slam.runtime.errors import RunError, SlamError
 from slam.runtime.files import write_atomically
 
 
-def test_makes_folders_and_replaces_what_was_there(tmp_path: Path) -> None:
+def test_makes_folders_and_replaces_what_was_there(tmp_path: Path):
     path = tmp_path / "a" / "b" / "map.ply"
     for text in ("old", "new"):
 
@@ -32,7 +32,7 @@ def test_makes_folders_and_replaces_what_was_there(tmp_path: Path) -> None:
 )
 def test_after_any_failure_the_old_file_stays_and_no_partial_file(
     tmp_path: Path, failure: BaseException
-) -> None:
+):
     path = tmp_path / "run.log"
     path.write_text("old")
 

@@ -35,7 +35,7 @@ assert import_open3d().visualization.draw_plotly
     [WINDOWS, pytest.param(IN_NOTEBOOK, marks=pytest.mark.slow)],
     ids=["windows at their first use", "whole in a notebook"],
 )
-def test_open3d_is_imported(code: str) -> None:
+def test_open3d_is_imported(code: str):
     finished = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=False
     )

@@ -11,7 +11,7 @@ from slam.runtime.errors import SlamError
 from slam.runtime.memory import SpillFile
 
 
-def test_arrays_come_back_in_any_order() -> None:
+def test_arrays_come_back_in_any_order():
     rng = np.random.default_rng(0)
     arrays = [
         rng.integers(0, 255, (4, 5, 3), np.uint8),
@@ -27,7 +27,7 @@ def test_arrays_come_back_in_any_order() -> None:
         assert each.read().dtype == array.dtype
 
 
-def test_threads_read_while_others_write() -> None:
+def test_threads_read_while_others_write():
     spill_file = SpillFile()
 
     def write_and_read(number: int) -> bool:
@@ -38,7 +38,7 @@ def test_threads_read_while_others_write() -> None:
         assert all(threads.map(write_and_read, range(40)))
 
 
-def test_a_file_that_was_cut_short_is_an_error_and_no_garbage() -> None:
+def test_a_file_that_was_cut_short_is_an_error_and_no_garbage():
     spill_file = SpillFile()
     kept = spill_file.put(np.ones((100, 100)))
     spill_file._file.truncate(5000)

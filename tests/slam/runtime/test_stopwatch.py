@@ -9,7 +9,7 @@ import pytest
 from slam.runtime.stopwatch import Stopwatch
 
 
-def test_a_stage_adds_up_over_its_visits_also_when_it_fails() -> None:
+def test_a_stage_adds_up_over_its_visits_also_when_it_fails():
     watch = Stopwatch()
     with watch.stage("read"):
         time.sleep(0.001)

@@ -44,7 +44,7 @@ distortion_coefficients: {{data: {}}}
 """
 
 
-def test_search_order(tmp_path: Path, camera_yaml: str) -> None:
+def test_search_order(tmp_path: Path, camera_yaml: str):
     inner = tmp_path / "inner"
     inner.mkdir()
     with pytest.raises(SequenceError, match=r"no camera\.yaml for images: looked in .*inner and "):
@@ -61,7 +61,7 @@ def test_search_order(tmp_path: Path, camera_yaml: str) -> None:
         find_camera_file(tmp_path / "nowhere.yaml", inner, wanted_by="images", images=IMAGES)
 
 
-def test_a_horizontal_field_of_view_is_a_camera(tmp_path: Path) -> None:
+def test_a_horizontal_field_of_view_is_a_camera(tmp_path: Path):
     camera = find_camera_file(Path("fov=90"), tmp_path, wanted_by="images", images=IMAGES)
     assert (camera.width, camera.height, camera.fps) == (40, 24, 10)
     assert camera.fx == camera.fy == pytest.approx(20)  # half the width of 40 pixels at 45 degrees
@@ -78,7 +78,7 @@ def test_a_horizontal_field_of_view_is_a_camera(tmp_path: Path) -> None:
     )
 
 
-def test_a_whole_camera_on_one_line(tmp_path: Path) -> None:
+def test_a_whole_camera_on_one_line(tmp_path: Path):
     camera = find_camera_file(
         Path("fov=90,height=1.4,fps=15"), tmp_path, wanted_by="images", images=IMAGES
     )
@@ -142,7 +142,7 @@ COLMAP = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 OPENCV 40 24 30 31 20.5
         ("cameras.txt", COLMAP, 10),
     ],
 )
-def test_the_same_camera_by_every_program(tmp_path: Path, name: str, text: str, fps: float) -> None:
+def test_the_same_camera_by_every_program(tmp_path: Path, name: str, text: str, fps: float):
     (tmp_path / name).write_text(text)
     camera = read_explicit(tmp_path / name)
     assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (
@@ -157,7 +157,7 @@ def test_the_same_camera_by_every_program(tmp_path: Path, name: str, text: str, 
     np.testing.assert_array_equal(camera.distortion[:4], [-0.1, 0.02, 0.001, -0.002])
 
 
-def test_lenses(tmp_path: Path) -> None:
+def test_lenses(tmp_path: Path):
     path = tmp_path / "camera.yaml"
     path.write_text(KALIBR.replace("radtan", "equidistant"))
     assert read_explicit(path).model == "fisheye"
@@ -191,7 +191,7 @@ def test_lenses(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_is_wrong_is_one_line(tmp_path: Path, name: str, text: str, words: str) -> None:
+def test_what_is_wrong_is_one_line(tmp_path: Path, name: str, text: str, words: str):
     (tmp_path / name).write_text(text)
     with pytest.raises((SequenceError, DataError), match=words) as caught:
         read_explicit(tmp_path / name)
@@ -222,7 +222,7 @@ def seen_by_lens(points_camera: np.ndarray, camera: CameraFile) -> np.ndarray:
 
 
 @pytest.mark.parametrize("count", [4, 5, 8])
-def test_coefficients_without_a_name_are_those_of_opencv(tmp_path: Path, count: int) -> None:
+def test_coefficients_without_a_name_are_those_of_opencv(tmp_path: Path, count: int):
     distortion = [-0.1, 0.02, *[0.0] * (count - 2)]
     (tmp_path / "ros.yaml").write_text(NAMELESS.format("", distortion))
     camera = read_explicit(tmp_path / "ros.yaml")
@@ -238,7 +238,7 @@ projection_parameters: {fx: 30, fy: 31, cx: 20, cy: 12}
 """
 
 
-def test_settings_of_vins(tmp_path: Path) -> None:
+def test_settings_of_vins(tmp_path: Path):
     (tmp_path / "vins.yaml").write_text(VINS)
     camera = read_explicit(tmp_path / "vins.yaml")
     assert (camera.model, camera.fy, camera.distortion) == ("opencv", 31, (-0.1, 0.02, 0.0, 0.0))
@@ -251,7 +251,7 @@ def test_settings_of_vins(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_points_land_on_the_pinhole_projection(name: str) -> None:
+def test_points_land_on_the_pinhole_projection(name: str):
     camera = lens(name)
     undistortion = Undistortion(camera)
     pixels = undistortion.intrinsics.pixel_grid()[10::20, 10::20].reshape(-1, 2)
@@ -262,7 +262,7 @@ def test_points_land_on_the_pinhole_projection(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_no_black_border_and_none_to_spare(name: str) -> None:
+def test_no_black_border_and_none_to_spare(name: str):
     undistortion = Undistortion(lens(name))
     white = undistortion.apply(np.full((HEIGHT, WIDTH, 3), 255, np.uint8))
     assert (white == 255).all()
@@ -273,7 +273,7 @@ def test_no_black_border_and_none_to_spare(name: str) -> None:
     assert slack < 0.02 * WIDTH
 
 
-def test_folding_lens_is_refused_or_cropped() -> None:
+def test_folding_lens_is_refused_or_cropped():
     """A radius that runs backwards must not come into the image."""
     camera = lens("barrel").model_copy(update={"distortion": (-0.9, 0.0, 0.0, 0.0)})
     undistortion = Undistortion(camera)
@@ -291,7 +291,7 @@ def test_folding_lens_is_refused_or_cropped() -> None:
         Undistortion(folded)
 
 
-def test_black_of_a_mask_is_fixed_to_the_camera(tmp_path: Path) -> None:
+def test_black_of_a_mask_is_fixed_to_the_camera(tmp_path: Path):
     """Found beside the file, bent with the images; another size or no file is one line."""
     keys = {"width": 320, "height": 240, "fx": 200.0, "fy": 200.0, "cx": 160.0, "cy": 120.0}
     text = "".join(f"{name}: {value}\n" for name, value in {**keys, "fps": 10}.items())

@@ -27,7 +27,7 @@ RECORDINGS = [
 ]
 
 
-def test_several_sequences_are_listed(tmp_path: Path, odometry) -> None:
+def test_several_sequences_are_listed(tmp_path: Path, odometry):
     for name in ("02", "10", "00"):
         odometry(tmp_path, name=name, frames=2)
     assert list(sequence_kinds(tmp_path)) == ["00", "02", "10"]
@@ -43,7 +43,7 @@ def test_several_sequences_are_listed(tmp_path: Path, odometry) -> None:
     )
 
 
-def test_sequence_without_images_says_so(tmp_path: Path, odometry) -> None:
+def test_sequence_without_images_says_so(tmp_path: Path, odometry):
     odometry(tmp_path)
     (tmp_path / "sequences/09").mkdir()
     (tmp_path / "sequences/09/calib.txt").write_text("")
@@ -52,7 +52,7 @@ def test_sequence_without_images_says_so(tmp_path: Path, odometry) -> None:
         open_sequence(tmp_path, "09")
 
 
-def test_name_of_a_folder_inside(tmp_path: Path, images, camera_yaml: str) -> None:
+def test_name_of_a_folder_inside(tmp_path: Path, images, camera_yaml: str):
     images(tmp_path / "mine", ["0.png", "1.png"])
     (tmp_path / "mine" / "camera.yaml").write_text(camera_yaml)
     assert open_sequence(tmp_path, "mine").name == "mine"
@@ -61,7 +61,7 @@ def test_name_of_a_folder_inside(tmp_path: Path, images, camera_yaml: str) -> No
         open_sequence(tmp_path / "mine", "yours")
 
 
-def test_the_door_is_light() -> None:
+def test_the_door_is_light():
     code = "import sys, slam.sequences.catalogue; print({'torch', 'gtsam', 'open3d', 'evo'} & sys.modules.keys())"
     answer = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
@@ -69,9 +69,7 @@ def test_the_door_is_light() -> None:
     assert answer.stdout.strip() == "set()"
 
 
-def test_a_folder_of_recordings_lists_all(
-    tmp_path: Path, images, odometry, camera_yaml: str
-) -> None:
+def test_a_folder_of_recordings_lists_all(tmp_path: Path, images, odometry, camera_yaml: str):
     images(tmp_path / "left", ["0.png"])
     images(tmp_path / "right/images", ["0.png"])
     odometry(tmp_path / "kitti", name="03", frames=2)
@@ -113,7 +111,7 @@ def shown(sequence) -> list[int]:
     return [round(float(sequence.frame(k).image.mean())) for k in range(len(sequence))]
 
 
-def test_chapters_of_a_camera(trip: Path) -> None:
+def test_chapters_of_a_camera(trip: Path):
     for k, name in enumerate(("GX010042", "GX020042", "GX030042")):
         write_clip(trip / f"{name}.avi", 20 * k)
     write_clip(trip / "GX010043.avi", 200)
@@ -128,7 +126,7 @@ def test_chapters_of_a_camera(trip: Path) -> None:
     np.testing.assert_allclose(gap[[18, 19, 20]], [0.1, 2.1, 0.1], atol=1e-6)
 
 
-def test_files_named_by_their_time(trip: Path) -> None:
+def test_files_named_by_their_time(trip: Path):
     for k, second in enumerate((0, 2, 4, 8, 59)):
         write_clip(trip / f"20240101_1200{second:02d}_F.avi", 20 * k)
     assert sorted(sequence_kinds(trip)) == ["20240101_120000_F", "20240101_120059_F"]
@@ -137,7 +135,7 @@ def test_files_named_by_their_time(trip: Path) -> None:
     np.testing.assert_allclose(np.diff(sequence.stamps)[[19, 39, 59]], [0.1, 0.1, 2.1], atol=1e-6)
 
 
-def test_two_trips_of_a_day_are_two_recordings(trip: Path) -> None:
+def test_two_trips_of_a_day_are_two_recordings(trip: Path):
     for k, hour in enumerate((8, 18)):
         write_clip(trip / f"20240101_{hour:02d}0000_F.avi", 20 * k)
     assert sorted(sequence_kinds(trip)) == ["20240101_080000_F", "20240101_180000_F"]
@@ -145,9 +143,7 @@ def test_two_trips_of_a_day_are_two_recordings(trip: Path) -> None:
     np.testing.assert_allclose(shown(later), range(20, 40), atol=2)
 
 
-def test_clips_named_by_the_minute_that_are_shorter(
-    trip: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_clips_named_by_the_minute_that_are_shorter(trip: Path, caplog: pytest.LogCaptureFixture):
     for k, minute in enumerate((0, 1, 2, 4)):
         write_clip(trip / f"20240101_12{minute:02d}00_F.avi", 20 * k)
     gaps = np.diff(open_sequence(trip).stamps)
@@ -155,7 +151,7 @@ def test_clips_named_by_the_minute_that_are_shorter(
     assert "named 60 s apart: taken as following each other" in caplog.text
 
 
-def test_numbered_folders(trip: Path, images) -> None:
+def test_numbered_folders(trip: Path, images):
     for name in ("000", "001"):
         images(trip / name, [f"{k}.png" for k in range(5)])
     sequence = open_sequence(trip)
@@ -171,7 +167,7 @@ def test_numbered_folders(trip: Path, images) -> None:
         ("walk_part1", "walk_part2", "walk_part3"),
     ],
 )
-def test_namings_of_pieces(trip: Path, names: tuple[str, ...]) -> None:
+def test_namings_of_pieces(trip: Path, names: tuple[str, ...]):
     for k, name in enumerate(names):
         write_clip(trip / f"{name}.avi", 20 * k)
     np.testing.assert_allclose(open_sequence(trip).stamps, 0.1 * np.arange(60), atol=1e-6)
@@ -180,7 +176,7 @@ def test_namings_of_pieces(trip: Path, names: tuple[str, ...]) -> None:
 @pytest.mark.parametrize("path, name, frames, length_m, height_m", RECORDINGS)
 def test_opens(
     data_root: Path, path: str, name: str | None, frames: int, length_m: float | None, height_m
-) -> None:
+):
     sequence = open_sequence(data_root / path, name)
     assert len(sequence) == frames == len(sequence.stamps)
     K = sequence.intrinsics
@@ -197,12 +193,12 @@ def test_opens(
     assert steps.sum() == pytest.approx(length_m, abs=1)
 
 
-def test_roots_list_their_sequences(data_root: Path) -> None:
+def test_roots_list_their_sequences(data_root: Path):
     assert list(sequence_kinds(data_root / "kitti_odometry")) == ["00", "02", "05"]
     assert list(sequence_kinds(data_root / "kitti_raw")) == ["2011_09_26_drive_0013"]
 
 
-def test_raw_drive_goes_forward_and_smoothly(data_root: Path) -> None:
+def test_raw_drive_goes_forward_and_smoothly(data_root: Path):
     sequence = open_sequence(data_root / "kitti_raw")
     assert (sequence.intrinsics.width, sequence.intrinsics.height) == (828, 250)
     assert sequence.intrinsics.fx == pytest.approx(721.5377 * 2 / 3)
@@ -215,7 +211,7 @@ def test_raw_drive_goes_forward_and_smoothly(data_root: Path) -> None:
     assert sequence.has_scan(47) and not sequence.has_scan(48)
 
 
-def test_lidar_lands_on_the_image(data_root: Path) -> None:
+def test_lidar_lands_on_the_image(data_root: Path):
     """Road points in front of the car project below the horizon, at the camera's height."""
     sequence = open_sequence(data_root / "kitti_raw")
     assert sequence.T_camera_lidar is not None

@@ -17,7 +17,7 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def test_csv(tmp_path: Path) -> None:
+def test_csv(tmp_path: Path):
     text = "stamp, latitude, longitude, altitude\n0.0,49.0,8.4,115\n1.0,49.00001,8.4,115.5\n"
     track = read_gps(written(tmp_path, text))
     np.testing.assert_array_equal(track.stamps, [0.0, 1.0])
@@ -45,12 +45,12 @@ def test_csv(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_is_no_track(tmp_path: Path, text: str, said: str) -> None:
+def test_what_is_no_track(tmp_path: Path, text: str, said: str):
     with pytest.raises(SequenceError, match=said):
         read_gps(written(tmp_path, text))
 
 
-def test_bad_fixes_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_bad_fixes_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     rows = [f"{k},49.000{k},8,100" for k in range(8)]
     rows[3], rows[5] = "3,nan,8,100", "4,49.0004,8,100"
     (tmp_path / "track").write_text("\n".join(["stamp,latitude,longitude,altitude", *rows, "9,,,"]))
@@ -58,7 +58,7 @@ def test_bad_fixes_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture
     assert "3 of 9 rows" in caplog.text and "line 5" in caplog.text
 
 
-def test_a_dash_cam_that_gives_no_altitude(tmp_path: Path) -> None:
+def test_a_dash_cam_that_gives_no_altitude(tmp_path: Path):
     text = "Time,Lat,Lon,Speed (km/h)\n2026-05-03T12:30:05Z,49,8,36\n2026-05-03T12:30:06Z,49.00009,8,\n"
     track = read_gps(written(tmp_path, text))
     assert track.stamps.tolist() == [1777811405.0, 1777811406.0]

@@ -25,7 +25,7 @@ IMU_TO_VELO = "calib_time: now\nR: 1 0 0 0 1 0 0 0 1\nT: -0.8 0.3 -0.8\n"
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 @pytest.mark.parametrize("layout", ["root", "dataset", "sequences", "one"])
-def test_layouts_and_formats(tmp_path: Path, odometry, layout: str, suffix: str) -> None:
+def test_layouts_and_formats(tmp_path: Path, odometry, layout: str, suffix: str):
     base = tmp_path / "dataset" if layout == "dataset" else tmp_path
     odometry(base, suffix=suffix)
     given = {"sequences": base / "sequences", "one": base / "sequences" / "00"}.get(
@@ -41,9 +41,7 @@ def test_layouts_and_formats(tmp_path: Path, odometry, layout: str, suffix: str)
 
 
 @pytest.mark.parametrize("camera", [0, 1, 2, 3])
-def test_each_camera_has_its_intrinsics_and_reference(
-    tmp_path: Path, odometry, camera: int
-) -> None:
+def test_each_camera_has_its_intrinsics_and_reference(tmp_path: Path, odometry, camera: int):
     folder = odometry(tmp_path, camera=camera)
     rows = (folder / "calib.txt").read_text().splitlines()
     rows[camera] = rows[camera].replace("30 0 20", "31 0 20", 1).replace("30 12", "31 12")
@@ -55,7 +53,7 @@ def test_each_camera_has_its_intrinsics_and_reference(
     assert sequence.reference[4, :3, 3] == pytest.approx([0, 0, 4])
 
 
-def test_reference_of_a_turning_rig(tmp_path: Path, odometry) -> None:
+def test_reference_of_a_turning_rig(tmp_path: Path, odometry):
     """The rig turns right by 90 degrees about camera 0; camera 2, 6 cm left of it, swings forward."""
     odometry(tmp_path, frames=2)
     (tmp_path / "poses/00.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n0 0 1 0 0 1 0 0 -1 0 0 0\n")
@@ -63,7 +61,7 @@ def test_reference_of_a_turning_rig(tmp_path: Path, odometry) -> None:
     assert reference[1, :3, 3] == pytest.approx([0.06, 0, 0.06])
 
 
-def test_colour_is_preferred_to_grey(tmp_path: Path, odometry) -> None:
+def test_colour_is_preferred_to_grey(tmp_path: Path, odometry):
     odometry(tmp_path, camera=0)
     odometry(tmp_path, camera=3, suffix=".jpg")
     sequence = open_sequence(tmp_path, "00")
@@ -71,7 +69,7 @@ def test_colour_is_preferred_to_grey(tmp_path: Path, odometry) -> None:
     assert sequence.T_camera_lidar[:3, 3] == pytest.approx([0.1 - 0.47, 0.2, 0.3])
 
 
-def test_scans(tmp_path: Path, odometry) -> None:
+def test_scans(tmp_path: Path, odometry):
     folder = odometry(tmp_path)
     (folder / "velodyne").mkdir()
     (folder / "velodyne" / "000002.bin").write_bytes(np.array([7, 8, 9, 1], np.float32).tobytes())
@@ -82,9 +80,7 @@ def test_scans(tmp_path: Path, odometry) -> None:
         sequence.scan(0)
 
 
-def test_missing_times_fall_back(
-    tmp_path: Path, odometry, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_missing_times_fall_back(tmp_path: Path, odometry, caplog: pytest.LogCaptureFixture):
     folder = odometry(tmp_path)
     (folder / "times.txt").unlink()
     with caplog.at_level(logging.WARNING):
@@ -93,7 +89,7 @@ def test_missing_times_fall_back(
     assert "times.txt" in caplog.text
 
 
-def test_simulated_root(tmp_path: Path, odometry, camera_yaml: str) -> None:
+def test_simulated_root(tmp_path: Path, odometry, camera_yaml: str):
     odometry(tmp_path, name="sim")
     (tmp_path / "camera.yaml").write_text(camera_yaml + "camera_height_m: 1.52\n")
     (tmp_path / "simulation.json").write_text(json.dumps({"seed": 612}))
@@ -105,7 +101,7 @@ def test_simulated_root(tmp_path: Path, odometry, camera_yaml: str) -> None:
         open_sequence(tmp_path)
 
 
-def test_given_camera_replaces_calibration(tmp_path: Path, odometry, camera_yaml: str) -> None:
+def test_given_camera_replaces_calibration(tmp_path: Path, odometry, camera_yaml: str):
     odometry(tmp_path)
     path = tmp_path / "mine.yaml"
     path.write_text(camera_yaml.replace("fx: 30", "fx: 33") + "camera_height_m: unknown\n")
@@ -136,9 +132,7 @@ def test_given_camera_replaces_calibration(tmp_path: Path, odometry, camera_yaml
         ("image_2/*.png", None, "looked for png or jpg in .*image_2"),
     ],
 )
-def test_broken_sequences(
-    tmp_path: Path, odometry, file: str, content: str | None, message: str
-) -> None:
+def test_broken_sequences(tmp_path: Path, odometry, file: str, content: str | None, message: str):
     folder = odometry(tmp_path)
     for path in [*folder.glob(file)] or [folder / file]:
         path.unlink(missing_ok=True)
@@ -151,14 +145,14 @@ def test_broken_sequences(
 
 @pytest.mark.parametrize("bad", ["1", "soon", "nan"])
 @pytest.mark.parametrize("row", [2, 5])
-def test_a_bad_time_is_interpolated(tmp_path: Path, odometry, bad: str, row: int) -> None:
+def test_a_bad_time_is_interpolated(tmp_path: Path, odometry, bad: str, row: int):
     times = [str(k) for k in range(6)]
     times[row] = bad
     (odometry(tmp_path) / "times.txt").write_text("\n".join(times))
     np.testing.assert_allclose(open_sequence(tmp_path, "00").stamps, np.arange(6), atol=1e-9)
 
 
-def test_a_bad_pose_is_bridged(tmp_path: Path, odometry) -> None:
+def test_a_bad_pose_is_bridged(tmp_path: Path, odometry):
     odometry(tmp_path)
     path = tmp_path / "poses/00.txt"
     rows = path.read_text().splitlines()
@@ -169,7 +163,7 @@ def test_a_bad_pose_is_bridged(tmp_path: Path, odometry) -> None:
     )
 
 
-def test_later_damage_is_an_error_when_read(tmp_path: Path, odometry) -> None:
+def test_later_damage_is_an_error_when_read(tmp_path: Path, odometry):
     folder = odometry(tmp_path)
     path = folder / "image_2/000004.png"
     path.write_bytes(path.read_bytes()[:40])
@@ -205,7 +199,7 @@ def test_missing_numbers_are_missing_frames(
     caplog: pytest.LogCaptureFixture,
     times: list[int] | None,
     poses: list[int],
-) -> None:
+):
     if times is None:
         (gap / "times.txt").unlink()
     else:
@@ -261,7 +255,7 @@ def write_drive(root: Path, late_s: float = 0.0, name: str = NAME) -> Path:
 
 @pytest.mark.parametrize("given", ["drive", "date", "root"])
 @pytest.mark.parametrize("name", [None, NAME, f"{NAME}_sync", f"{DATE}/{NAME}_sync"])
-def test_layouts(tmp_path: Path, given: str, name: str | None) -> None:
+def test_layouts(tmp_path: Path, given: str, name: str | None):
     drive = write_drive(tmp_path)
     dataset = {"drive": drive, "date": drive.parent, "root": tmp_path}[given]
     sequence = open_sequence(dataset, name)
@@ -271,7 +265,7 @@ def test_layouts(tmp_path: Path, given: str, name: str | None) -> None:
     assert sequence.scan(2).tolist() == [[7, 8, 9]] and not sequence.has_scan(1)
 
 
-def test_calibration_follows_the_image_size(tmp_path: Path) -> None:
+def test_calibration_follows_the_image_size(tmp_path: Path):
     sequence = open_sequence(write_drive(tmp_path))
     K = sequence.intrinsics
     assert (K.width, K.height, K.fx, K.fy, K.cx, K.cy) == (40, 24, 30, 30, 19.5, 11.5)
@@ -280,7 +274,7 @@ def test_calibration_follows_the_image_size(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.008])
-def test_reference_drives_along_z(tmp_path: Path, late_s: float) -> None:
+def test_reference_drives_along_z(tmp_path: Path, late_s: float):
     """The camera moves 1 m a frame straight ahead, whenever the packets were taken."""
     reference = open_sequence(write_drive(tmp_path, late_s)).reference
     assert reference is not None and se3.is_se3(reference)
@@ -289,7 +283,7 @@ def test_reference_drives_along_z(tmp_path: Path, late_s: float) -> None:
     assert reference[:, :3, 3] == pytest.approx(wanted, abs=1e-3)
 
 
-def test_root_with_several_drives(tmp_path: Path) -> None:
+def test_root_with_several_drives(tmp_path: Path):
     write_drive(tmp_path)
     write_drive(tmp_path, name=f"{DATE}_drive_0014")
     assert list(sequence_kinds(tmp_path)) == [NAME, f"{DATE}_drive_0014"]
@@ -298,7 +292,7 @@ def test_root_with_several_drives(tmp_path: Path) -> None:
     assert open_sequence(tmp_path, f"{DATE}_drive_0014").name == f"{DATE}_drive_0014"
 
 
-def test_optional_parts(tmp_path: Path) -> None:
+def test_optional_parts(tmp_path: Path):
     drive = write_drive(tmp_path)
     (drive.parent / "calib_imu_to_velo.txt").unlink()
     sequence = open_sequence(drive)
@@ -320,7 +314,7 @@ def packet(**columns: float) -> np.ndarray:
     return row
 
 
-def test_axes_by_hand() -> None:
+def test_axes_by_hand():
     """Yaw 0 looks east and grows to the north; pitch puts the nose down, roll the left side up."""
     packets = np.stack([packet(), packet(yaw=np.pi / 2), packet(pitch=0.1), packet(roll=0.1)])
     R = T_world_imu(packets, np.zeros(4))[:, :3, :3]
@@ -330,7 +324,7 @@ def test_axes_by_hand() -> None:
     assert (R[3] @ [0, 1, 0])[2] == pytest.approx(np.sin(0.1))  # left side up
 
 
-def test_packets_are_extrapolated_to_their_image() -> None:
+def test_packets_are_extrapolated_to_their_image():
     moving = packet(vn=1.0, ve=2.0, vu=3.0, wz=0.5)[None]
     T = T_world_imu(np.concatenate([moving, moving]), np.array([0.0, 0.01]))
     assert T[1, :3, 3] - T[0, :3, 3] == pytest.approx([0.02, 0.01, 0.03])

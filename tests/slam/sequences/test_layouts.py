@@ -57,7 +57,7 @@ def write_truth(body: Path, first: int, stop: int) -> None:
 
 
 @pytest.mark.parametrize("given", [".", "..", "../.."])
-def test_euroc_opens(flight: Path, given: str) -> None:
+def test_euroc_opens(flight: Path, given: str):
     write_truth(flight, 0, FRAMES)
     sequence = open_sequence((flight / given).resolve())
     assert (sequence.name, len(sequence), sequence.camera_height_m) == ("MH_07", FRAMES, None)
@@ -72,7 +72,7 @@ def test_euroc_opens(flight: Path, given: str) -> None:
 
 def test_true_poses_of_some_frames_are_those_of_an_excerpt(
     flight: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     write_truth(flight, 3, FRAMES)
     with caplog.at_level(logging.WARNING):
         assert open_sequence(flight).reference is None
@@ -81,7 +81,7 @@ def test_true_poses_of_some_frames_are_those_of_an_excerpt(
     assert excerpt is not None and excerpt[:, 0, 3] == pytest.approx([0, 1, 2])
 
 
-def test_rows_without_an_image_are_gaps(flight: Path) -> None:
+def test_rows_without_an_image_are_gaps(flight: Path):
     for k in (0, 3):
         (flight / f"cam0/data/{FIRST_NS + k * STEP_NS}.png").unlink()
     sequence = open_sequence(flight)
@@ -93,7 +93,7 @@ def test_rows_without_an_image_are_gaps(flight: Path) -> None:
 
 def test_a_camera_file_replaces_the_calibration_and_one_beside_gives_the_height(
     flight: Path, tmp_path: Path, camera_yaml: str, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     given = tmp_path / "mine.yaml"
     given.write_text(camera_yaml)
     sensor = flight / "cam0/sensor.yaml"
@@ -111,7 +111,7 @@ def test_a_camera_file_replaces_the_calibration_and_one_beside_gives_the_height(
 
 
 @pytest.mark.data
-def test_the_real_sample(data_root: Path) -> None:
+def test_the_real_sample(data_root: Path):
     sequence = open_sequence(data_root / "euroc_micro")
     assert (sequence.name, len(sequence)) == ("euroc_micro", 95)
     assert np.diff(sequence.stamps) == pytest.approx(0.05, abs=1e-4)
@@ -145,7 +145,7 @@ def write_tum_truth(freiburg: Path, stamps: np.ndarray) -> None:
     (freiburg / "groundtruth.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + "".join(rows))
 
 
-def test_tum_opens(freiburg: Path) -> None:
+def test_tum_opens(freiburg: Path):
     sequence = open_sequence(freiburg)
     assert (sequence.name, len(sequence), sequence.reference) == ("freiburg", 3, None)
     assert sequence.stamps.tolist() == STAMPS
@@ -154,7 +154,7 @@ def test_tum_opens(freiburg: Path) -> None:
     assert sequence.camera_height_m is None and not sequence.has_scan(0)
 
 
-def test_tum_truth_is_interpolated(freiburg: Path) -> None:
+def test_tum_truth_is_interpolated(freiburg: Path):
     write_tum_truth(freiburg, np.arange(100.0, 100.2, 0.02))
     reference = open_sequence(freiburg).reference
     assert np.array_equal(reference[0], np.eye(4))
@@ -165,7 +165,7 @@ def test_tum_truth_is_interpolated(freiburg: Path) -> None:
     assert reference[1, 0, 2] == pytest.approx(np.sin(0.015), abs=1e-6)
 
 
-def test_tum_bad_rows_are_left_out(freiburg: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_tum_bad_rows_are_left_out(freiburg: Path, caplog: pytest.LogCaptureFixture):
     known = open_sequence(freiburg)
     index = freiburg / "rgb.txt"
     rows = index.read_text().splitlines()
@@ -180,7 +180,7 @@ def test_tum_bad_rows_are_left_out(freiburg: Path, caplog: pytest.LogCaptureFixt
 )
 def test_registered_depth_maps_belong_to_the_images_of_their_stamps(
     freiburg: Path, rows: tuple[str, str]
-) -> None:
+):
     sequence = open_sequence(freiburg)
     assert sequence.true_depth_frames() == []
     cv2.imwrite(str(freiburg / "near.png"), np.full((4, 6), 10_000, dtype=np.uint16))
@@ -212,7 +212,7 @@ def walk(tmp_path: Path, images) -> Path:
 
 
 @pytest.mark.parametrize("lens", [LENS, f"FOV {LENS}"])
-def test_tum_mono_opens(walk: Path, lens: str) -> None:
+def test_tum_mono_opens(walk: Path, lens: str):
     (walk / "camera.txt").write_text(f"{lens}\n40 24\ncrop\n40 24\n")
     assert sequence_kinds(walk) == {"sequence_01": "TUM mono"}
     sequence = open_sequence(walk)
@@ -224,7 +224,7 @@ def test_tum_mono_opens(walk: Path, lens: str) -> None:
     assert start is not None and start[:, 2, 3] == pytest.approx([0, 1, 2])
 
 
-def test_the_fov_lens_bends_radii_to_angles() -> None:
+def test_the_fov_lens_bends_radii_to_angles():
     """A ray at 45 degrees, its tangent 1, by the formula of the model; the centre stays."""
     keys = {"width": 200, "height": 100, "fx": 90, "fy": 90, "cx": 99.5, "cy": 49.5, "fps": 10}
     lens = Undistortion(camera_of({**keys, "model": "fov", "distortion": [0.9]}, "here"))
@@ -238,7 +238,7 @@ def test_the_fov_lens_bends_radii_to_angles() -> None:
     assert flat[:, :99].max() == 0 and flat[:, 101:].min() == 255
 
 
-def test_tum_mono_damage(walk: Path) -> None:
+def test_tum_mono_damage(walk: Path):
     (walk / "camera.txt").write_text("0.5 0.8\n40 24\n")
     with pytest.raises(SequenceError, match=r"camera\.txt needs a row of fx fy cx cy"):
         open_sequence(walk)
@@ -290,7 +290,7 @@ def scene(tmp_path: Path, images) -> Path:
     return folder
 
 
-def test_seven_scenes(chess: Path) -> None:
+def test_seven_scenes(chess: Path):
     assert sequence_kinds(chess) == {"seq-01": "7-Scenes", "seq-02": "7-Scenes"}
     sequence = open_sequence(chess, "seq-01")
     assert (sequence.name, len(sequence), sequence.intrinsics.fx) == ("chess_seq-01", 5, 585)
@@ -304,7 +304,7 @@ def test_seven_scenes(chess: Path) -> None:
     assert open_sequence(chess / "seq-02").name == "chess_seq-02"
 
 
-def test_scannet(scene: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_scannet(scene: Path, caplog: pytest.LogCaptureFixture):
     with caplog.at_level(logging.WARNING):
         sequence = open_sequence(scene)
     assert sequence_kinds(scene) == {"scene0000_00": "ScanNet"}
@@ -383,7 +383,7 @@ def nuscenes(tmp_path: Path, images) -> Path:
     return root
 
 
-def test_nuscenes(nuscenes: Path) -> None:
+def test_nuscenes(nuscenes: Path):
     assert sequence_kinds(nuscenes) == {"scene-0061": "nuScenes", "scene-0103": "nuScenes"}
     sequence = open_sequence(nuscenes, "scene-0061")
     assert (len(sequence), sequence.intrinsics.fx, sequence.camera_height_m) == (
@@ -414,7 +414,7 @@ def test_nuscenes(nuscenes: Path) -> None:
         ("sample_data", "[]", "CAM_FRONT"),
     ],
 )
-def test_nuscenes_damaged_tables(nuscenes: Path, name: str, text: str, message: str) -> None:
+def test_nuscenes_damaged_tables(nuscenes: Path, name: str, text: str, message: str):
     (nuscenes / "v1.0-mini" / f"{name}.json").write_text(text)
     with pytest.raises(SequenceError, match=message):
         open_sequence(nuscenes, "scene-0061")

@@ -35,9 +35,7 @@ DOCS = Path(__file__).parents[3] / "docs"
     ("inner", "beside", "suffix"),
     [("", False, ".png"), ("images", True, ".jpg"), ("data", False, ".jpeg"), ("", True, ".bmp")],
 )
-def test_layouts(
-    tmp_path: Path, images, camera_yaml: str, inner: str, beside: bool, suffix: str
-) -> None:
+def test_layouts(tmp_path: Path, images, camera_yaml: str, inner: str, beside: bool, suffix: str):
     folder = tmp_path / "drive"
     images(folder / inner, [f"f{k}{suffix}" for k in range(12)])
     ((tmp_path if beside else folder) / "camera.yaml").write_text(camera_yaml)
@@ -50,7 +48,7 @@ def test_layouts(
     assert sequence.provenance() == ("folder/drive[0:12]",)
 
 
-def test_inner_folder_has_the_outer_name(tmp_path: Path, images, camera_yaml: str) -> None:
+def test_inner_folder_has_the_outer_name(tmp_path: Path, images, camera_yaml: str):
     images(tmp_path / "drive" / "images", ["0.png", "1.png"])
     (tmp_path / "drive" / "camera.yaml").write_text(camera_yaml + "camera_height_m: 1.4\n")
     sequence = open_sequence(tmp_path / "drive" / "images", None, None, "1:")
@@ -58,7 +56,7 @@ def test_inner_folder_has_the_outer_name(tmp_path: Path, images, camera_yaml: st
     assert sequence.provenance() == ("folder/drive[1:2]",)
 
 
-def test_undistorts(tmp_path: Path, images, camera_yaml: str) -> None:
+def test_undistorts(tmp_path: Path, images, camera_yaml: str):
     images(tmp_path, ["0.png", "1.png"])
     (tmp_path / "camera.yaml").write_text(
         camera_yaml + "model: opencv\ndistortion: [-0.2, 0, 0, 0]\n"
@@ -69,7 +67,7 @@ def test_undistorts(tmp_path: Path, images, camera_yaml: str) -> None:
 
 def test_a_gap_in_the_numbers_is_a_gap_in_time(
     tmp_path: Path, images, camera_yaml: str, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     images(tmp_path, ["f17.png", "f18.png", "f21.png", "f22.png"])
     (tmp_path / "camera.yaml").write_text(camera_yaml)
     sequence = open_sequence(tmp_path)
@@ -90,9 +88,7 @@ def test_a_gap_in_the_numbers_is_a_gap_in_time(
 @pytest.mark.parametrize(
     "fps, last", [(50, 202), (5, 60), (50, 10**15)], ids=["frames", "seconds", "for ever"]
 )
-def test_a_long_gap_is_refused(
-    tmp_path: Path, images, camera_yaml: str, fps: int, last: int
-) -> None:
+def test_a_long_gap_is_refused(tmp_path: Path, images, camera_yaml: str, fps: int, last: int):
     images(tmp_path, [f"{k}.png" for k in range(5)] + [f"{last}.png"])
     (tmp_path / "camera.yaml").write_text(camera_yaml.replace("fps: 5", f"fps: {fps}"))
     with pytest.raises(
@@ -105,7 +101,7 @@ def test_a_long_gap_is_refused(
 @pytest.mark.parametrize("step", ["1e8", "1e-9", "nan"])
 def test_stamps_that_cannot_be_seconds_are_refused(
     tmp_path: Path, images, camera_yaml: str, step: str
-) -> None:
+):
     images(tmp_path, [f"{k}.png" for k in range(4)])
     (tmp_path / "camera.yaml").write_text(camera_yaml)
     (tmp_path / "times.txt").write_text("".join(f"{k * float(step):.12f}\n" for k in range(4)))
@@ -114,7 +110,7 @@ def test_stamps_that_cannot_be_seconds_are_refused(
 
 
 @pytest.mark.parametrize("form", ["{}.{:06d}.png", "{}{:06d}000.png", "left_{}{:06d}.png"])
-def test_names_that_are_times(tmp_path: Path, images, camera_yaml: str, form: str) -> None:
+def test_names_that_are_times(tmp_path: Path, images, camera_yaml: str, form: str):
     microseconds = [900_000, 933_333, 1_200_000]
     images(
         tmp_path, [form.format(1403715273 + each // 10**6, each % 10**6) for each in microseconds]
@@ -136,14 +132,14 @@ def test_names_that_are_times(tmp_path: Path, images, camera_yaml: str, form: st
         ("timestamps.txt", "1403715273000\n1403715273100\n1403715273300\n"),
     ],
 )
-def test_tables_of_times(tmp_path: Path, images, camera_yaml: str, name: str, rows: str) -> None:
+def test_tables_of_times(tmp_path: Path, images, camera_yaml: str, name: str, rows: str):
     images(tmp_path, ["0.png", "1.png", "2.png"])
     (tmp_path / "camera.yaml").write_text(camera_yaml)
     (tmp_path / name).write_text(rows)
     assert np.diff(open_sequence(tmp_path).stamps) == pytest.approx([0.1, 0.2], abs=1e-6)
 
 
-def test_a_table_of_times_cut_to_match_as_advised(tmp_path: Path, images, camera_yaml: str) -> None:
+def test_a_table_of_times_cut_to_match_as_advised(tmp_path: Path, images, camera_yaml: str):
     images(tmp_path, ["0.png", "1.png"])
     (tmp_path / "camera.yaml").write_text(camera_yaml)
     times = ["0.0", "0.1", "0.2", "0.3"]
@@ -154,9 +150,7 @@ def test_a_table_of_times_cut_to_match_as_advised(tmp_path: Path, images, camera
     assert len(open_sequence(tmp_path)) == 2
 
 
-def test_times_beside_the_folder_of_images_that_is_named(
-    tmp_path: Path, images, camera_yaml: str
-) -> None:
+def test_times_beside_the_folder_of_images_that_is_named(tmp_path: Path, images, camera_yaml: str):
     (tmp_path / "images").mkdir()
     images(tmp_path / "images", ["0.png", "1.png"])
     (tmp_path / "camera.yaml").write_text(camera_yaml)
@@ -164,9 +158,7 @@ def test_times_beside_the_folder_of_images_that_is_named(
     assert open_sequence(tmp_path / "images").stamps.tolist() == [5.0, 5.3]
 
 
-def test_a_camera_of_another_size_scaled_as_advised(
-    tmp_path: Path, images, camera_yaml: str
-) -> None:
+def test_a_camera_of_another_size_scaled_as_advised(tmp_path: Path, images, camera_yaml: str):
     images(tmp_path, ["0.png", "1.png"])
     path = tmp_path / "camera.yaml"
     keys = yaml.safe_load(camera_yaml)
@@ -181,9 +173,7 @@ def test_a_camera_of_another_size_scaled_as_advised(
     assert open_sequence(tmp_path).intrinsics.fx == pytest.approx(keys["fx"] / 2)
 
 
-def test_the_first_readable_image_gives_the_size_and_another_is_named(
-    tmp_path: Path, images
-) -> None:
+def test_the_first_readable_image_gives_the_size_and_another_is_named(tmp_path: Path, images):
     images(tmp_path, ["0.png", "1.png", "3.png"])
     images(tmp_path, ["2.png"], width=41)
     (tmp_path / "0.png").write_bytes(b"")
@@ -211,7 +201,7 @@ def camera_64(camera_yaml: str) -> str:
 
 
 @pytest.mark.parametrize("by_folder", [False, True])
-def test_opens(tmp_path: Path, camera_64: str, by_folder: bool) -> None:
+def test_opens(tmp_path: Path, camera_64: str, by_folder: bool):
     path = write_video(tmp_path / "trip" / "drive.avi")
     (tmp_path / "trip" / "camera.yaml").write_text(camera_64)
     (tmp_path / "trip" / "._drive.avi").write_bytes(b"what macOS keeps beside a file")
@@ -250,7 +240,7 @@ def write_mp4(
 
 
 @pytest.mark.parametrize(("rotated", "ratio"), [(False, 4 / 3), (True, 3 / 4)])
-def test_pixels_of_a_video_that_are_not_square(tmp_path: Path, rotated: bool, ratio: float) -> None:
+def test_pixels_of_a_video_that_are_not_square(tmp_path: Path, rotated: bool, ratio: float):
     path = write_mp4(tmp_path / "a.mp4", [0, 60, 120, 180], rotated=rotated, aspect="4/3")
     camera = open_sequence(path, camera=Path("fov=70")).intrinsics
     assert camera.fy / camera.fx == pytest.approx(ratio)
@@ -259,7 +249,7 @@ def test_pixels_of_a_video_that_are_not_square(tmp_path: Path, rotated: bool, ra
 
 def test_uneven_frame_times_are_used(
     tmp_path: Path, camera_64: str, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     path = write_mp4(tmp_path / "phone.mp4", UNEVEN)
     camera = tmp_path / "camera.yaml"
     camera.write_text(camera_64.replace("fps: 5", "fps: 20"))
@@ -272,7 +262,7 @@ def test_uneven_frame_times_are_used(
     )
 
 
-def test_missing_frames_do_not_change_the_rate(tmp_path: Path, camera_64: str) -> None:
+def test_missing_frames_do_not_change_the_rate(tmp_path: Path, camera_64: str):
     times = [60 * k for k in range(60) if k % 7 and not 30 <= k < 35]
     path = write_mp4(tmp_path / "drive.mp4", times)
     (tmp_path / "camera.yaml").write_text(camera_64.replace("fps: 5", "fps: 10"))
@@ -281,7 +271,7 @@ def test_missing_frames_do_not_change_the_rate(tmp_path: Path, camera_64: str) -
 
 def test_even_frames_have_the_rate_of_the_video(
     tmp_path: Path, camera_64: str, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     path = write_mp4(tmp_path / "phone.mp4", [120 * k for k in range(12)])
     camera = tmp_path / "camera.yaml"
     for fps, stamps in (
@@ -298,7 +288,7 @@ def test_even_frames_have_the_rate_of_the_video(
     )
 
 
-def test_a_field_of_view_takes_the_rate_of_the_video(tmp_path: Path) -> None:
+def test_a_field_of_view_takes_the_rate_of_the_video(tmp_path: Path):
     path = write_mp4(tmp_path / "phone.mp4", [24 * k for k in range(8)])
     sequence = open_sequence(path, camera=Path("fov=90"))
     assert sequence.intrinsics.fx == pytest.approx(32)
@@ -308,7 +298,7 @@ def test_a_field_of_view_takes_the_rate_of_the_video(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
 def test_frames_and_times_of_a_long_video_are_those_of_its_packets(
     tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     """An mkv announces a guess: its duration times a rate."""
     path = write_mp4(tmp_path / f"long{suffix}", UNEVEN)
     monkeypatch.setattr(loader, "VideoFrames", partial(VideoFrames, counted_frames=4))
@@ -317,7 +307,7 @@ def test_frames_and_times_of_a_long_video_are_those_of_its_packets(
     assert ("announces 14 frames and has 10" in caplog.text) == (suffix == ".mkv")
 
 
-def test_a_rotation_flag_turns_the_images(tmp_path: Path) -> None:
+def test_a_rotation_flag_turns_the_images(tmp_path: Path):
     """A phone held upright stores lying images and a flag: 90 degrees, so that left becomes top."""
     path = write_mp4(tmp_path / "upright.mp4", [20 * k for k in range(4)], rotated=True)
     sequence = open_sequence(path, camera=Path("fov=60"))
@@ -357,7 +347,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
 
 def test_the_example_is_a_loader(
     tmp_path: Path, images, camera_yaml: str, install: Callable[[Path], str]
-) -> None:
+):
     code = install(DOCS / "design" / "loaders.md")
     assert (
         len(
@@ -390,7 +380,7 @@ def test_the_example_is_a_loader(
     ) and line.endswith("(our drives)")
 
 
-def test_the_example_is_a_source_of_depth(install: Callable[[Path], str]) -> None:
+def test_the_example_is_a_source_of_depth(install: Callable[[Path], str]):
     with pytest.raises(ConfigError, match=r"network, onnx:FILE, npy:FOLDER or png:FOLDER"):
         load_config(None, ["depth.source=flat:2.5"])
     install(DOCS / "depth.md")

@@ -45,7 +45,7 @@ def reference(recording: Path, truth: Path, frames: str | None = None) -> FloatA
     return open_sequence(recording, frames=frames, truth=truth).reference
 
 
-def test_a_row_a_frame(recording: Path, truth: Path) -> None:
+def test_a_row_a_frame(recording: Path, truth: Path):
     write_kitti(truth, Trajectory(np.arange(8.0), true_poses()))
     found = reference(recording, truth)
     assert found is not None
@@ -55,7 +55,7 @@ def test_a_row_a_frame(recording: Path, truth: Path) -> None:
     np.testing.assert_allclose(part, np.linalg.inv(true_poses()[3]) @ true_poses()[3:6], atol=1e-6)
 
 
-def test_rows_with_stamps_are_interpolated_at_the_frames(recording: Path, truth: Path) -> None:
+def test_rows_with_stamps_are_interpolated_at_the_frames(recording: Path, truth: Path):
     write_tum(truth, Trajectory(np.arange(0.0, 0.71, 0.1)[::2], true_poses()[::2]))
     found = reference(recording, truth, "0:7")
     assert found is not None
@@ -64,7 +64,7 @@ def test_rows_with_stamps_are_interpolated_at_the_frames(recording: Path, truth:
 
 def test_rows_with_frame_numbers_are_of_these_frames(
     recording: Path, truth: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     rows = [f"{k} {' '.join(map(str, true_poses()[k, :3].ravel()))}\n" for k in range(3, FRAMES)]
     truth.write_text("".join(rows))
     assert reference(recording, truth) is None
@@ -74,7 +74,7 @@ def test_rows_with_frame_numbers_are_of_these_frames(
     np.testing.assert_allclose(part, np.linalg.inv(true_poses()[2]) @ true_poses()[2:], atol=0.1)
 
 
-def test_poses_beside_a_folder_are_named_and_not_used(recording: Path) -> None:
+def test_poses_beside_a_folder_are_named_and_not_used(recording: Path):
     beside = recording.parent / "poses.kitti.txt"
     write_kitti(beside, Trajectory(np.arange(8.0), true_poses()))
     assert open_sequence(recording).reference is None
@@ -95,7 +95,7 @@ def tum_rows() -> list[list[str]]:
 @pytest.mark.parametrize("wrong", ["nan", "cut off", "swapped", "reversed", "semicolons"])
 def test_a_table_that_is_slightly_wrong_costs_no_reference(
     recording: Path, truth: Path, wrong: str
-) -> None:
+):
     rows = tum_rows()
     match wrong:
         case "nan":
@@ -112,9 +112,7 @@ def test_a_table_that_is_slightly_wrong_costs_no_reference(
     np.testing.assert_allclose(found, true_poses(), atol=0.03)
 
 
-def test_stamps_in_another_unit_are_named_and_divided_they_fit(
-    recording: Path, truth: Path
-) -> None:
+def test_stamps_in_another_unit_are_named_and_divided_they_fit(recording: Path, truth: Path):
     rows = tum_rows()
     truth.write_text("\n".join(" ".join([f"{1e6 * float(t):.1f}", *others]) for t, *others in rows))
     with pytest.raises(

@@ -18,11 +18,11 @@ from slam.simulation.recording import SimulatedSequence
         (" 2 : 5 ", (2, 5)),
     ],
 )
-def test_ranges(text: str, wanted: tuple[int, int]) -> None:
+def test_ranges(text: str, wanted: tuple[int, int]):
     assert frame_range(text, 10) == wanted
 
 
-def test_sources_are_clipped_to_the_named_recording() -> None:
+def test_sources_are_clipped_to_the_named_recording():
     source = Source("kitti_odometry/08", first=-1100, length=4071)
     assert source.label(5177) == "kitti_odometry/08[0:4071]"
     assert source.shifted(2000).label(100) == "kitti_odometry/08[900:1000]"
@@ -30,7 +30,7 @@ def test_sources_are_clipped_to_the_named_recording() -> None:
     assert Source("simulated/7", first=None).shifted(5).label(3) == "simulated/7"
 
 
-def test_rebased_is_rigid_and_starts_at_the_identity() -> None:
+def test_rebased_is_rigid_and_starts_at_the_identity():
     rng = np.random.default_rng(0)
     T = np.tile(np.eye(4), (3, 1, 1))
     T[:, :3, 3] = rng.normal(size=(3, 3))
@@ -47,7 +47,7 @@ def simulated() -> SimulatedSequence:
     )
 
 
-def test_is_a_sequence(simulated: SimulatedSequence) -> None:
+def test_is_a_sequence(simulated: SimulatedSequence):
     assert (simulated.name, len(simulated)) == ("sim", 20)
     assert np.allclose(simulated.intrinsics.K, simulated.street.K)
     assert simulated.provenance() == ("simulated/1001",)
@@ -57,7 +57,7 @@ def test_is_a_sequence(simulated: SimulatedSequence) -> None:
     assert not simulated.has_scan(0)
 
 
-def test_frames_are_those_of_the_street(simulated: SimulatedSequence) -> None:
+def test_frames_are_those_of_the_street(simulated: SimulatedSequence):
     frame, truth = simulated.frame(3), simulated.street.render(3)
     assert frame.image.shape == (32, 104, 3) and frame.stamp == pytest.approx(0.3)
     assert np.array_equal(frame.image, truth)
@@ -65,7 +65,7 @@ def test_frames_are_those_of_the_street(simulated: SimulatedSequence) -> None:
     assert np.array_equal(simulated.frame(3).image, truth)  # the memory is not the caller's
 
 
-def test_excerpt_keeps_the_world(simulated: SimulatedSequence) -> None:
+def test_excerpt_keeps_the_world(simulated: SimulatedSequence):
     excerpt = simulated.cut(4, 10)
     assert excerpt.provenance() == ("simulated/1001",)
     assert np.array_equal(excerpt.frame(0).image, simulated.frame(4).image)

@@ -53,7 +53,7 @@ def drive(bag: Any, topic: str = "/cam0/image_raw", encoding: str = "mono8") -> 
         )
 
 
-def test_opens(new_bag: NewBag, kind: str) -> None:
+def test_opens(new_bag: NewBag, kind: str):
     bag = new_bag(kind)
     drive(bag)
     path = bag.close()
@@ -75,7 +75,7 @@ def test_opens(new_bag: NewBag, kind: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_compressed_images(new_bag: NewBag, kind: str, suffix: str) -> None:
+def test_compressed_images(new_bag: NewBag, kind: str, suffix: str):
     bag = new_bag(kind)
     bag.camera_info("/camera/camera_info", CAMERA, "plumb_bob", (0.0,) * 5)
     data = cv2.imencode(suffix, picture(1, 3))[1].ravel()
@@ -88,7 +88,7 @@ def test_compressed_images(new_bag: NewBag, kind: str, suffix: str) -> None:
 
 
 @pytest.mark.parametrize(("encoding", "channels"), CHANNELS.items())
-def test_encodings_of_a_grey_picture(new_bag: NewBag, encoding: str, channels: int) -> None:
+def test_encodings_of_a_grey_picture(new_bag: NewBag, encoding: str, channels: int):
     """Channels of equal value are grey in every encoding; of YUV 4:2:2 those with chroma 128."""
     level = 90
     pixels = np.full((24, 40, channels), level, np.uint8)
@@ -104,7 +104,7 @@ def test_encodings_of_a_grey_picture(new_bag: NewBag, encoding: str, channels: i
     assert image[0, 0, 0] == pytest.approx(level, abs=16)  # video levels of YUV are stretched
 
 
-def test_calibration(new_bag: NewBag, kind: str) -> None:
+def test_calibration(new_bag: NewBag, kind: str):
     bag = new_bag(kind)
     drive(bag, "/raw/image_raw")
     drive(bag, "/flat/image_rect")
@@ -126,7 +126,7 @@ def test_calibration(new_bag: NewBag, kind: str) -> None:
     assert open_sequence(path, "/bare/image_raw", Path("fov=90")).intrinsics.fx == pytest.approx(20)
 
 
-def test_images_are_a_binned_region_of_the_calibrated_sensor(new_bag: NewBag, kind: str) -> None:
+def test_images_are_a_binned_region_of_the_calibrated_sensor(new_bag: NewBag, kind: str):
     """A sensor of 87x60 with its calibration; the images show 80x48 of it, binned to 40x24."""
     sensor = Intrinsics(87, 60, 60, 60, 44.5, 31.5)
     bag = new_bag(kind)
@@ -143,7 +143,7 @@ def test_images_are_a_binned_region_of_the_calibrated_sensor(new_bag: NewBag, ki
     )  # the driver states a binning of whole images
 
 
-def test_rectified_images_stand_for_the_raw_ones_beside_them(new_bag: NewBag, kind: str) -> None:
+def test_rectified_images_stand_for_the_raw_ones_beside_them(new_bag: NewBag, kind: str):
     bag = new_bag(kind)
     drive(bag)
     bag.image("/cam0/image_rect", FIRST_NS, picture(0), "mono8")
@@ -153,7 +153,7 @@ def test_rectified_images_stand_for_the_raw_ones_beside_them(new_bag: NewBag, ki
 
 def test_a_clock_that_was_set_back_gives_way_to_the_times_of_recording(
     new_bag: NewBag, kind: str, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     bag = new_bag(kind)
     bag.camera_info("/cam0/camera_info", CAMERA, "plumb_bob", (0.0,) * 5)
     for k in range(40):
@@ -171,7 +171,7 @@ def test_a_clock_that_was_set_back_gives_way_to_the_times_of_recording(
     assert "1.00 s at message 20" in caplog.text
 
 
-def test_a_camera_file_beside_a_bag_may_have_the_height_alone(new_bag: NewBag) -> None:
+def test_a_camera_file_beside_a_bag_may_have_the_height_alone(new_bag: NewBag):
     bag = new_bag()
     drive(bag)
     path = bag.close()
@@ -180,7 +180,7 @@ def test_a_camera_file_beside_a_bag_may_have_the_height_alone(new_bag: NewBag) -
     assert sequence.camera_height_m == 1.3 and sequence.intrinsics == CAMERA
 
 
-def test_true_poses_and_scans_come_with_their_static_transforms(new_bag: NewBag, kind: str) -> None:
+def test_true_poses_and_scans_come_with_their_static_transforms(new_bag: NewBag, kind: str):
     """The body moves 1 m along its x a frame; the camera looks along that axis, the LiDAR is 2 m above the camera."""
     bag = new_bag(kind)
     drive(bag)
@@ -229,7 +229,7 @@ def test_true_poses_and_scans_come_with_their_static_transforms(new_bag: NewBag,
     ]
 
 
-def test_damaged_bags_are_named_in_one_line(new_bag: NewBag, kind: str) -> None:
+def test_damaged_bags_are_named_in_one_line(new_bag: NewBag, kind: str):
     bag = new_bag(kind)
     drive(bag)
     path = bag.close()
@@ -246,7 +246,7 @@ def test_damaged_bags_are_named_in_one_line(new_bag: NewBag, kind: str) -> None:
 
 def test_an_mcap_of_another_program_is_named_and_converted_as_advised(
     tmp_path: Path, new_bag: NewBag
-) -> None:
+):
     def record(kind: int, content: bytes) -> bytes:
         return struct.pack("<BQ", kind, len(content)) + content
 
@@ -275,7 +275,7 @@ def test_an_mcap_of_another_program_is_named_and_converted_as_advised(
 @pytest.mark.parametrize("how", ["tf", "topic", "frame", "unnamed"])
 def test_true_poses_are_those_that_are_named_so(
     new_bag: NewBag, kind: str, how: str, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     bag = new_bag(kind)
     drive(bag)
     bag.mount("rig", "camera", bag.transform((0, 0, 1)))
@@ -303,7 +303,7 @@ def test_true_poses_are_those_that_are_named_so(
         )
 
 
-def test_a_calibration_without_a_size_is_of_the_images(new_bag: NewBag, kind: str) -> None:
+def test_a_calibration_without_a_size_is_of_the_images(new_bag: NewBag, kind: str):
     bag = new_bag(kind)
     bag.camera_info(
         "/cam0/camera_info", SimpleNamespace(**(vars(CAMERA) | {"width": 0, "height": 0})), "", ()
@@ -312,7 +312,7 @@ def test_a_calibration_without_a_size_is_of_the_images(new_bag: NewBag, kind: st
     assert open_sequence(bag.close()).intrinsics == CAMERA
 
 
-def test_compressed_images_of_16_bits_share_a_stretch(new_bag: NewBag, kind: str) -> None:
+def test_compressed_images_of_16_bits_share_a_stretch(new_bag: NewBag, kind: str):
     bag = new_bag(kind)
     bag.camera_info("/c/camera_info", CAMERA, "", ())
     for k in range(2):
@@ -327,7 +327,7 @@ def test_compressed_images_of_16_bits_share_a_stretch(new_bag: NewBag, kind: str
     assert bright == pytest.approx(2 * dark, rel=0.05)
 
 
-def test_a_bag_without_images_says_what_it_holds(new_bag: NewBag, kind: str) -> None:
+def test_a_bag_without_images_says_what_it_holds(new_bag: NewBag, kind: str):
     bag = new_bag(kind)
     bag.camera_info("/cam0/camera_info", CAMERA, "plumb_bob", (0.0,) * 5)
     bag.image("/depth/image_raw", FIRST_NS, np.ones((24, 40), np.uint16), "16UC1")
@@ -340,9 +340,7 @@ def test_a_bag_without_images_says_what_it_holds(new_bag: NewBag, kind: str) -> 
     assert examine(path)[-1].startswith("missing")
 
 
-def test_without_rosbags_the_extra_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_rosbags_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "walk.bag").write_bytes(b"")
 
     def absent(name: str) -> None:

@@ -44,7 +44,7 @@ def streamed(source: Scripted, wait_s: float = 60.0, every_frame: bool = False) 
     return StreamedSequence("scripted", source, camera, wait_s, every_frame)
 
 
-def test_a_source_that_is_faster_than_we_are_is_dropped_from() -> None:
+def test_a_source_that_is_faster_than_we_are_is_dropped_from():
     """While we are busy with the first of 51 images, all others come; the last two of them wait."""
     first_is_taken = Event()
     source = Scripted(51, lambda number: number and first_is_taken.wait())
@@ -56,7 +56,7 @@ def test_a_source_that_is_faster_than_we_are_is_dropped_from() -> None:
     assert taken == [0, 49, 50] and sequence.dropped == 48 and sequence.ended == "the source ended"
 
 
-def test_with_every_frame_a_source_waits_until_its_image_was_taken() -> None:
+def test_with_every_frame_a_source_waits_until_its_image_was_taken():
     source = Scripted(20, lambda number: None)
     source.is_stored = True
     sequence, taken = streamed(source, every_frame=True), []
@@ -68,7 +68,7 @@ def test_with_every_frame_a_source_waits_until_its_image_was_taken() -> None:
     )
 
 
-def test_a_source_that_stalls_and_one_that_dies_say_so() -> None:
+def test_a_source_that_stalls_and_one_that_dies_say_so():
     released = Event()
     stalls = streamed(Scripted(2, lambda number: number and released.wait()), 0.2)
     assert len(list(stalls.frames())) == 1 and stalls.ended == "nothing came for 0.2 s"
@@ -106,7 +106,7 @@ def served(video: Path) -> Iterator[str]:
         server.shutdown()
 
 
-def test_an_address_gives_images_as_they_arrive(video: Path) -> None:
+def test_an_address_gives_images_as_they_arrive(video: Path):
     with served(video) as name:
         stamps, images = zip(*open_source(name, 5.0).images(Event()), strict=True)
     assert [round(float(image.mean()) / 30) for image in images] == list(range(8))
@@ -133,7 +133,7 @@ class Camera(BaseHTTPRequestHandler):
         pass
 
 
-def test_a_camera_that_comes_late_and_breaks_off_is_opened_again() -> None:
+def test_a_camera_that_comes_late_and_breaks_off_is_opened_again():
     with ThreadingHTTPServer(("127.0.0.1", 0), Camera) as found:
         address = found.server_address
     server = ThreadingHTTPServer(address, Camera, bind_and_activate=False)
@@ -156,7 +156,7 @@ def test_a_camera_that_comes_late_and_breaks_off_is_opened_again() -> None:
     assert seen == sorted(seen) and seen[0] == 0 and len(set(seen)) >= 5
 
 
-def test_a_video_plays_at_its_own_speed(video: Path) -> None:
+def test_a_video_plays_at_its_own_speed(video: Path):
     source = VideoSource(str(video), 0.1)
     assert source.fps == 20.0
     stamps = [stamp for stamp, _ in source.images(Event())]
@@ -164,9 +164,7 @@ def test_a_video_plays_at_its_own_speed(video: Path) -> None:
     assert (source.width, source.height) == (32, 24)
 
 
-def test_a_folder_is_read_in_natural_order(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_folder_is_read_in_natural_order(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     """Numbers without zeros in front; hidden files are no images, and one that comes too late is named."""
 
     def take(number: int) -> None:
@@ -185,7 +183,7 @@ def test_a_folder_is_read_in_natural_order(
     )
 
 
-def test_a_broken_first_image_is_left_out(kitti_root: Path, tmp_path: Path) -> None:
+def test_a_broken_first_image_is_left_out(kitti_root: Path, tmp_path: Path):
     (tmp_path / "000000.png").write_bytes(b"damaged")
     shutil.copy(kitti_root / "sequences" / "sim" / "image_2" / "000001.png", tmp_path)
     source, stopped = FolderSource(tmp_path, 5.0), Event()
@@ -194,7 +192,7 @@ def test_a_broken_first_image_is_left_out(kitti_root: Path, tmp_path: Path) -> N
         stopped.set()
 
 
-def test_sources_that_are_not_there(tmp_path: Path) -> None:
+def test_sources_that_are_not_there(tmp_path: Path):
     with pytest.raises(SequenceError, match="no image comes from"):
         VideoSource(str(tmp_path / "none.mp4"), 0.1)
     with pytest.raises(SequenceError, match="no image comes from 99: check the camera"):

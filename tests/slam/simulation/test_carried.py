@@ -20,9 +20,7 @@ def turns_deg(world: SimulatedRooms) -> np.ndarray:
 
 
 @pytest.mark.parametrize("motion", get_args(Motion))
-def test_camera_keeps_clear_of_walls_and_furniture_and_turns_no_faster_than_asked(
-    motion: Motion,
-) -> None:
+def test_camera_keeps_clear_of_walls_and_furniture_and_turns_no_faster_than_asked(motion: Motion):
     world = carried(600, motion, 5.0)
     step = np.linalg.norm(np.diff(world.T_world_camera[:, :3, 3], axis=0), axis=1)
     assert world.distance_to_surface(world.T_world_camera[::3, :3, 3]).min() >= 0.3
@@ -33,7 +31,7 @@ def test_camera_keeps_clear_of_walls_and_furniture_and_turns_no_faster_than_aske
     )
 
 
-def test_a_higher_rate_takes_more_images_of_slower_turns() -> None:
+def test_a_higher_rate_takes_more_images_of_slower_turns():
     assert (
         turns_deg(carried(240, "phone", 60.0)).max() < 5.0 < turns_deg(carried(240, rate=5.0)).max()
     )

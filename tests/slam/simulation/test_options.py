@@ -4,7 +4,7 @@ import pytest
 from slam.simulation.options import draw_variety
 
 
-def test_varieties_cover_streets_and_cameras() -> None:
+def test_varieties_cover_streets_and_cameras():
     drawn = [draw_variety(seed, lone_road=True) for seed in range(300)]
     assert {one.kind for one in drawn} == {"town", "avenue", "country", "motorway"}
     for values, low, high in (
@@ -21,7 +21,7 @@ def test_varieties_cover_streets_and_cameras() -> None:
     assert all(draw_variety(seed, lone_road=False).kind != "motorway" for seed in range(60))
 
 
-def test_a_camera_keeps_its_field_of_view_when_its_image_is_shrunk() -> None:
+def test_a_camera_keeps_its_field_of_view_when_its_image_is_shrunk():
     one = next(
         one for one in (draw_variety(seed, True) for seed in range(50)) if one.aspect is not None
     )

@@ -12,7 +12,7 @@ from slam.simulation.recording import write_kitti_root
 from slam.simulation.street import SimulatedStreet
 
 
-def test_kitti_root_holds_what_was_rendered(tmp_path: Path) -> None:
+def test_kitti_root_holds_what_was_rendered(tmp_path: Path):
     street = SimulatedStreet(SimulationOptions("straight", 3, 712, 208, 64))
     root, written = tmp_path / "deep" / "world", []
     write_kitti_root(street, root, depth=True, lidar=True, progress=written.append)

@@ -23,7 +23,7 @@ def walk() -> SimulatedRooms:
     return rooms()
 
 
-def test_depth_at_true_poses_explains_the_next_depth(walk: SimulatedRooms) -> None:
+def test_depth_at_true_poses_explains_the_next_depth(walk: SimulatedRooms):
     for k in (5, 30):
         v, u = np.mgrid[0:72, 0:96].reshape(2, -1)
         points = np.linalg.inv(walk.K) @ np.stack([u, v, np.ones_like(u)]) * walk.depth(k).ravel()
@@ -37,7 +37,7 @@ def test_depth_at_true_poses_explains_the_next_depth(walk: SimulatedRooms) -> No
         assert np.median(np.abs(seen / moved[inside, 2] - 1.0)) < 0.005
 
 
-def test_depth_is_the_distance_to_the_surface_and_closes_the_room(walk: SimulatedRooms) -> None:
+def test_depth_is_the_distance_to_the_surface_and_closes_the_room(walk: SimulatedRooms):
     depth = walk.depth(7)
     assert (depth > 0).all() and depth.max() < 50.0
     v, u = np.mgrid[0:72:5, 0:96:5].reshape(2, -1)
@@ -46,9 +46,7 @@ def test_depth_is_the_distance_to_the_surface_and_closes_the_room(walk: Simulate
     assert np.quantile(walk.distance_to_surface(points_world), 0.99) < 1e-3
 
 
-def test_same_options_give_the_same_bytes_and_other_seeds_another_house(
-    walk: SimulatedRooms,
-) -> None:
+def test_same_options_give_the_same_bytes_and_other_seeds_another_house(walk: SimulatedRooms):
     again, other = rooms(), rooms(seed=4)
     assert np.array_equal(again.T_world_camera, walk.T_world_camera)
     assert np.array_equal(again.render(9), walk.render(9))
@@ -56,7 +54,7 @@ def test_same_options_give_the_same_bytes_and_other_seeds_another_house(
 
 
 @pytest.mark.parametrize("hazard", ["people", "exposure", "blur", "rolling-shutter"])
-def test_hazards_change_images_but_not_poses(walk: SimulatedRooms, hazard: str) -> None:
+def test_hazards_change_images_but_not_poses(walk: SimulatedRooms, hazard: str):
     world = rooms(hazards=(hazard,))
     changed = [
         np.abs(world.render(k).astype(float) - walk.render(k)).mean() for k in (5, 20, 40, 55)
@@ -67,21 +65,21 @@ def test_hazards_change_images_but_not_poses(walk: SimulatedRooms, hazard: str) 
         assert np.array_equal(world.depth(20), walk.depth(20))
 
 
-def test_people_have_depth() -> None:
+def test_people_have_depth():
     empty, peopled = rooms(300, 2), rooms(300, 2, hazards=("people",))
     depths = [(peopled.depth(k), empty.depth(k)) for k in range(0, 300, 12)]
     assert max((with_people < without - 0.05).mean() for with_people, without in depths) > 0.01
     assert not any((with_people > without).any() for with_people, without in depths)
 
 
-def test_exposure_follows_the_light() -> None:
+def test_exposure_follows_the_light():
     world = rooms(300, 4, hazards=("exposure",))
     brightness = [world.render(k).mean() for k in range(0, 300, 60)]
     assert np.median(brightness) == pytest.approx(0.4 * 255, rel=0.4)
     assert np.ptp([world._gain(k) for k in range(0, 300, 30)]) > 0.1
 
 
-def test_a_root_on_disk_has_the_exact_surface(walk: SimulatedRooms, tmp_path: Path) -> None:
+def test_a_root_on_disk_has_the_exact_surface(walk: SimulatedRooms, tmp_path: Path):
     short, root = rooms(4, rate=30.0), tmp_path / "world"
     write_kitti_root(short, root, depth=True, mesh=True)
     sequence = open_sequence(root)

@@ -64,7 +64,7 @@ def warp_error(street: SimulatedStreet, target: int, source: int) -> tuple[float
 
 
 @pytest.mark.parametrize("route", ["loop", "grid", "straight"])
-def test_poses_start_at_the_world_and_keep_clear_of_everything_above_the_road(route: str) -> None:
+def test_poses_start_at_the_world_and_keep_clear_of_everything_above_the_road(route: str):
     street = SimulatedStreet(SimulationOptions(route, 300, 702, 208, 64))
     assert len(street) == 300 and street.T_world_camera.shape == (300, 4, 4)
     assert np.array_equal(street.T_world_camera[0], np.eye(4))
@@ -84,7 +84,7 @@ def test_poses_start_at_the_world_and_keep_clear_of_everything_above_the_road(ro
 
 
 @pytest.mark.parametrize(("frames", "seed"), [(250, 703), (300, 704), (800, 704)])
-def test_loop_revisits_its_start_and_turns_left_and_right(frames: int, seed: int) -> None:
+def test_loop_revisits_its_start_and_turns_left_and_right(frames: int, seed: int):
     street = SimulatedStreet(SimulationOptions("loop", frames, seed))
     assert revisited(street)[0] >= 60.0
     ground, travelled, heading = path_of(street)
@@ -93,20 +93,20 @@ def test_loop_revisits_its_start_and_turns_left_and_right(frames: int, seed: int
     assert np.linalg.norm(ground - ground[0], axis=1)[travelled > 60].min() < 1.0
 
 
-def test_grid_is_revisited_in_both_directions() -> None:
+def test_grid_is_revisited_in_both_directions():
     again = np.array(
         [revisited(SimulatedStreet(SimulationOptions("grid", 800, s)), 5.5) for s in (705, 706)]
     )
     assert (again[:, 0] > 20.0).all() and (again[:, 1] > 20.0).all()
 
 
-def test_truth_explains_the_next_image(straight: SimulatedStreet) -> None:
+def test_truth_explains_the_next_image(straight: SimulatedStreet):
     for k in (3, 20):
         error, unmoved = warp_error(straight, k, k + 1)
         assert error < 5.0 and error < 0.6 * unmoved
 
 
-def test_depth_is_the_distance_to_the_surface(straight: SimulatedStreet) -> None:
+def test_depth_is_the_distance_to_the_surface(straight: SimulatedStreet):
     depth = straight.depth(7)
     assert depth.dtype == np.float32 and depth.max() <= 200.0
     assert 0.02 < (depth == 0).mean() < 0.6  # the sky
@@ -116,9 +116,7 @@ def test_depth_is_the_distance_to_the_surface(straight: SimulatedStreet) -> None
     assert np.quantile(straight.distance_to_surface(points), 0.99) < 1e-3
 
 
-def test_same_options_give_the_same_bytes_and_other_seeds_another_world(
-    straight: SimulatedStreet,
-) -> None:
+def test_same_options_give_the_same_bytes_and_other_seeds_another_world(straight: SimulatedStreet):
     again = SimulatedStreet(straight.options)
     assert np.array_equal(again.T_world_camera, straight.T_world_camera)
     assert np.array_equal(again.render(9), straight.render(9))
@@ -128,7 +126,7 @@ def test_same_options_give_the_same_bytes_and_other_seeds_another_world(
     assert np.abs(other.render(9).astype(float) - straight.render(9)).mean() > 10
 
 
-def test_moving_cars_are_seen_and_have_depth(traffic: SimulatedStreet) -> None:
+def test_moving_cars_are_seen_and_have_depth(traffic: SimulatedStreet):
     empty = SimulatedStreet(SimulationOptions("straight", 60, 701, **SMALL))
     for k in (5, 25):
         with_cars, without = traffic.depth(k), empty.depth(k)
@@ -139,7 +137,7 @@ def test_moving_cars_are_seen_and_have_depth(traffic: SimulatedStreet) -> None:
     assert np.array_equal(traffic.T_world_camera, empty.T_world_camera)
 
 
-def test_scans_lie_on_surfaces_and_spin_freely(straight: SimulatedStreet) -> None:
+def test_scans_lie_on_surfaces_and_spin_freely(straight: SimulatedStreet):
     scan, following = straight.scan(4), straight.scan(5)
     assert scan.dtype == np.float32 and scan.shape[1] == 4 and 20_000 < len(scan) < 60_000
     assert scan[:, 3].min() >= 0.0 and scan[:, 3].max() <= 1.0
@@ -156,7 +154,7 @@ def test_scans_lie_on_surfaces_and_spin_freely(straight: SimulatedStreet) -> Non
 
 
 @pytest.mark.slow
-def test_kiss_icp_follows_the_scans(straight: SimulatedStreet) -> None:
+def test_kiss_icp_follows_the_scans(straight: SimulatedStreet):
     config = pytest.importorskip("kiss_icp.config").load_config(None)
     odometry = pytest.importorskip("kiss_icp.kiss_icp").KissICP(config)
     for k in range(15):
@@ -166,7 +164,7 @@ def test_kiss_icp_follows_the_scans(straight: SimulatedStreet) -> None:
 
 
 @pytest.mark.slow
-def test_sunny_streets_saturate_a_little_and_have_slopes() -> None:
+def test_sunny_streets_saturate_a_little_and_have_slopes():
     shares, steepest = [], 0.0
     for seed in range(700, 706):
         street = SimulatedStreet(SimulationOptions("straight", 30, seed, 104, 32, varied=True))
@@ -176,7 +174,7 @@ def test_sunny_streets_saturate_a_little_and_have_slopes() -> None:
     assert 0.01 < np.mean(shares) < 0.15 and steepest > 0.03
 
 
-def test_a_bonnet_is_a_surface_before_the_camera() -> None:
+def test_a_bonnet_is_a_surface_before_the_camera():
     seed = next(seed for seed in range(700, 760) if draw_variety(seed, True).bonnet > 0.1)
     street = SimulatedStreet(SimulationOptions("straight", 30, seed, 104, 32, varied=True))
     near, later = (street.depth(index)[-1, 40:64] for index in (3, 20))

@@ -15,7 +15,7 @@ T_SCENE_CAMERA = se3.make(
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.1, -0.1])
-def test_depth_of_a_slope_is_that_of_hand(slope: float) -> None:
+def test_depth_of_a_slope_is_that_of_hand(slope: float):
     site = Site(np.random.default_rng(0))
     ground = site.instance("asphalt", np.full(3, 0.3))
     site.quad(

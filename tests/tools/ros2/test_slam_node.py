@@ -193,7 +193,7 @@ def test_the_node_publishes_what_slam_finds(
     tiny_weights: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:
+):
     drive = open_sequence(kitti_root)
     intrinsics, images = drive.intrinsics, [drive.frame(k).image for k in range(FRAMES)]
     written = tmp_path / "walk.txt"
@@ -260,7 +260,7 @@ def matrix(node_module: ModuleType, message: Any) -> FloatArray:
 
 def test_loops_move_the_map_and_not_the_odometry(
     node_module: ModuleType, kitti_root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     drive = open_sequence(kitti_root)
     images = [image_message(drive.frame(k).image, k) for k in range(FRAMES)]
     of_base = {"base_frame": "base_link", "map_every": 12, "keyframe_spacing": 0.5, "depth_to": 30}
@@ -309,7 +309,7 @@ def test_loops_move_the_map_and_not_the_odometry(
     np.testing.assert_allclose(matrix(node_module, only), invert(T_base_camera), atol=1e-9)
 
 
-def test_an_occupancy_grid_follows_its_keyframes(node_module: ModuleType) -> None:
+def test_an_occupancy_grid_follows_its_keyframes(node_module: ModuleType):
     """A wall 6 m ahead of two keyframes; the second one is moved by a loop."""
     from live_map import LiveMap
 
@@ -338,7 +338,7 @@ def test_an_occupancy_grid_follows_its_keyframes(node_module: ModuleType) -> Non
 
 def test_the_launch_file_gives_every_parameter(
     monkeypatch: pytest.MonkeyPatch, node_module: ModuleType
-) -> None:
+):
     launch = SimpleNamespace(
         LaunchDescription=list,
         LaunchConfiguration=str,
@@ -356,7 +356,7 @@ def test_the_launch_file_gives_every_parameter(
 
 def test_a_distorted_camera_and_one_that_is_rectified(
     node_module: ModuleType, kitti_root: Path, tiny_weights: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     drive = open_sequence(kitti_root)
     intrinsics, image = drive.intrinsics, drive.frame(0).image
     monkeypatch.setattr(

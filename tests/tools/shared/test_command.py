@@ -12,7 +12,7 @@ TOOLS = Path(__file__).parents[3] / "tools"
 @pytest.mark.parametrize("tool", sorted(TOOLS.glob("*.py")), ids=lambda p: p.name)
 def test_help_shows_an_example(
     tool: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+):
     monkeypatch.syspath_prepend(str(TOOLS))
     monkeypatch.setattr(sys, "argv", [str(tool), "--help"])
     with pytest.raises(SystemExit) as ended:

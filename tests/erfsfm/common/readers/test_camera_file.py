@@ -33,7 +33,7 @@ def written(tmp_path: Path, text: str) -> Path:
 @pytest.mark.parametrize(
     "line, height", [("", 1.65), ("camera_height_m: unknown", None), ("camera_height_m: 1.2", 1.2)]
 )
-def test_reads(tmp_path: Path, camera_yaml: str, line: str, height: float | None) -> None:
+def test_reads(tmp_path: Path, camera_yaml: str, line: str, height: float | None):
     camera = read_camera_file(written(tmp_path, camera_yaml + line))
     assert (camera.pinhole.fx, camera.pinhole.cy, camera.fps) == (30, 12, 5)
     assert camera.height_or(1.65) == height
@@ -61,7 +61,7 @@ def test_reads(tmp_path: Path, camera_yaml: str, line: str, height: float | None
 )
 def test_errors_are_one_line_and_name_the_key(
     tmp_path: Path, camera_yaml: str, text: str, message: str
-) -> None:
+):
     path = written(tmp_path, text.replace("{yaml}", camera_yaml))
     with pytest.raises(DataError) as caught:
         read_camera_file(path)
@@ -73,7 +73,7 @@ KITTI = Pinhole(1241, 376, 718.856, 718.856, 607.1928, 185.2157)
 
 
 @pytest.mark.parametrize("kind", [Camera, Intrinsics])
-def test_both_packages_resize_in_the_same_way(kind: type[Pinhole]) -> None:
+def test_both_packages_resize_in_the_same_way(kind: type[Pinhole]):
     half = kind.of(Pinhole(100, 60, 80.0, 82.0, 49.5, 29.5)).resized(50, 30)
     assert type(half) is kind
     assert (half.width, half.height, half.fx, half.fy, half.cx, half.cy) == (
@@ -97,9 +97,7 @@ def test_both_packages_resize_in_the_same_way(kind: type[Pinhole]) -> None:
     ],
     ids=["KITTI", "telephoto", "fisheye", "upright"],
 )
-def test_real_cameras_pass_without_a_warning(
-    camera: Pinhole, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_real_cameras_pass_without_a_warning(camera: Pinhole, caplog: pytest.LogCaptureFixture):
     with caplog.at_level(logging.WARNING):
         require_plausible(camera, "here")
     assert impossible(camera) is None and not caplog.records

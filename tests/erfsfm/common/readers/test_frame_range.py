@@ -17,7 +17,7 @@ from erfsfm.common.readers.kitti import ODOMETRY_DRIVES
         ("tum/[desk]", "tum/[desk]", 0, EVERYTHING),
     ],
 )
-def test_the_range_is_read_from_the_right(name: str, recording: str, start: int, stop: int) -> None:
+def test_the_range_is_read_from_the_right(name: str, recording: str, start: int, stop: int):
     span = FrameRange.parse(name)
     assert span == FrameRange(recording, start, stop)
     assert FrameRange.parse(str(span)) == span
@@ -42,13 +42,13 @@ def test_the_range_is_read_from_the_right(name: str, recording: str, start: int,
         ("folder/my_drive", "folder/my_drive[0:40]", True),
     ],
 )
-def test_leaks(name: str, seen: str, leaks: bool) -> None:
+def test_leaks(name: str, seen: str, leaks: bool):
     assert overlapping([name], [seen]) == ([name] if leaks else [])
     assert overlapping([seen], [name]) == ([seen] if leaks else []), "either way round"
 
 
 @pytest.mark.parametrize("sequence", sorted(ODOMETRY_DRIVES))
-def test_every_odometry_sequence_is_its_raw_drive(sequence: str) -> None:
+def test_every_odometry_sequence_is_its_raw_drive(sequence: str):
     drive, first, past_last = ODOMETRY_DRIVES[sequence]
     cut, whole = (
         FrameRange.parse(f"kitti_raw/{drive}[{first}:{past_last}]"),
@@ -83,12 +83,12 @@ def test_every_odometry_sequence_is_its_raw_drive(sequence: str) -> None:
         ("folder/a[3:]", "folder/a", "folder/a[3:]"),
     ],
 )
-def test_the_same_frames_by_other_numbers(name: str, recording: str, same: str | None) -> None:
+def test_the_same_frames_by_other_numbers(name: str, recording: str, same: str | None):
     found = FrameRange.parse(name).counted_in(recording)
     assert (str(found) if found else None) == same
 
 
-def test_merge() -> None:
+def test_merge():
     names = [
         "simulated/3",
         "simulated/1",

@@ -21,7 +21,7 @@ from erfsfm.common.readers.images import (
 )
 
 
-def test_reads_rgb_not_bgr(tmp_path: Path) -> None:
+def test_reads_rgb_not_bgr(tmp_path: Path):
     image = np.zeros((4, 6, 3), np.uint8)
     image[..., 2] = 200  # red in OpenCV's order
     cv2.imwrite(str(tmp_path / "a.png"), image)
@@ -32,16 +32,14 @@ def test_reads_rgb_not_bgr(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("dtype, value", [(np.uint8, 77), (np.uint16, 77 * 256)])
-def test_grey_and_16_bit_images_become_three_channels(
-    tmp_path: Path, dtype: type, value: int
-) -> None:
+def test_grey_and_16_bit_images_become_three_channels(tmp_path: Path, dtype: type, value: int):
     cv2.imwrite(str(tmp_path / "a.png"), np.full((4, 6), value, dtype))
     assert (read_image(tmp_path / "a.png") == 77).all()
     assert read_image(tmp_path / "a.png").shape == (4, 6, 3)
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])
-def test_a_part_of_sixteen_bits_is_stretched(tmp_path: Path, channels: int) -> None:
+def test_a_part_of_sixteen_bits_is_stretched(tmp_path: Path, channels: int):
     path = tmp_path / "a.png"
     grey = np.random.default_rng(0).integers(0, 256, (240, 320, channels))
     values = (7000 + grey * (2000 / 255)).astype(np.uint16)
@@ -54,7 +52,7 @@ def test_a_part_of_sixteen_bits_is_stretched(tmp_path: Path, channels: int) -> N
     assert read_image(path).max() == 0, "a black image is accepted"
 
 
-def test_one_stretch_serves_a_whole_recording(tmp_path: Path) -> None:
+def test_one_stretch_serves_a_whole_recording(tmp_path: Path):
     """Half of the images are darker, and stay so."""
     grey = np.random.default_rng(0).integers(0, 256, (24, 32))
     paths = [tmp_path / f"{k}.png" for k in range(8)]
@@ -70,7 +68,7 @@ def test_one_stretch_serves_a_whole_recording(tmp_path: Path) -> None:
 
 def test_a_flipped_bit_of_a_png_is_one_line_and_no_words_of_libpng(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+):
     path = tmp_path / "0.png"
     cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8))
     data = bytearray(path.read_bytes())
@@ -83,7 +81,7 @@ def test_a_flipped_bit_of_a_png_is_one_line_and_no_words_of_libpng(
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 @pytest.mark.parametrize("keep", [0.0, 0.97])
-def test_truncated_image_is_named(tmp_path: Path, suffix: str, keep: float) -> None:
+def test_truncated_image_is_named(tmp_path: Path, suffix: str, keep: float):
     path = tmp_path / f"000000{suffix}"
     cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 255, (60, 80, 3), dtype=np.uint8))
     path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
@@ -92,7 +90,7 @@ def test_truncated_image_is_named(tmp_path: Path, suffix: str, keep: float) -> N
             read(path)
 
 
-def test_a_video_behind_a_photo_is_left_out(tmp_path: Path) -> None:
+def test_a_video_behind_a_photo_is_left_out(tmp_path: Path):
     """As phones write motion photos; its bytes may look like markers."""
     path = tmp_path / "a.jpg"
     cv2.imwrite(str(path), np.full((60, 80, 3), 90, np.uint8))
@@ -105,7 +103,7 @@ def test_a_video_behind_a_photo_is_left_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("side", [9_000, 32_000])
-def test_more_pixels_than_can_be_are_not_taken_from_memory(tmp_path: Path, side: int) -> None:
+def test_more_pixels_than_can_be_are_not_taken_from_memory(tmp_path: Path, side: int):
     """The header announces them."""
     _, content = cv2.imencode(".png", np.zeros((8, 8), np.uint8))
     header = b"IHDR" + struct.pack(">II", side, side) + content.tobytes()[24:29]
@@ -125,7 +123,7 @@ def test_more_pixels_than_can_be_are_not_taken_from_memory(tmp_path: Path, side:
         read_image(tmp_path / "b.jpg")
 
 
-def test_natural_order_ignores_other_files(tmp_path: Path) -> None:
+def test_natural_order_ignores_other_files(tmp_path: Path):
     for name in ("img10.png", "img2.png", "img1.PNG", ".hidden.png", "ins.txt"):
         (tmp_path / name).write_bytes(b"")
     assert [p.name for p in list_images(tmp_path)] == ["img1.PNG", "img2.png", "img10.png"]
@@ -133,7 +131,7 @@ def test_natural_order_ignores_other_files(tmp_path: Path) -> None:
     assert has_images(tmp_path) and not has_images(tmp_path / "nowhere")
 
 
-def test_resize_down_averages() -> None:
+def test_resize_down_averages():
     image = np.zeros((8, 8, 3), np.uint8)
     image[::2] = 100
     assert (resize_image(image, 4, 4) == 50).all()

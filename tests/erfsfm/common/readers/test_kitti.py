@@ -20,7 +20,7 @@ from slam.geometry.se3 import invert
 
 
 @pytest.mark.parametrize("given", ["root[1]", "root[1]/dataset", "root[1]/dataset/sequences"])
-def test_odometry_roots(tmp_path: Path, given: str) -> None:
+def test_odometry_roots(tmp_path: Path, given: str):
     sequences = tmp_path / "root[1]/dataset/sequences"
     for name, camera in (("10", "image_3"), ("2", "image_0"), ("00", "")):
         (sequences / name / camera).mkdir(parents=True)
@@ -35,7 +35,7 @@ def test_odometry_roots(tmp_path: Path, given: str) -> None:
     assert find_odometry_root(tmp_path / "sequences") is None
 
 
-def test_drives(tmp_path: Path) -> None:
+def test_drives(tmp_path: Path):
     date = tmp_path / "2011_09_26"
     for name in (
         "2011_09_26_drive_0002_sync",
@@ -64,7 +64,7 @@ def calibration(tmp_path: Path):
     return write
 
 
-def test_lever_arm_by_hand(calibration) -> None:
+def test_lever_arm_by_hand(calibration):
     """KITTI's own colour camera: P2's column over the focal length is 6 cm, so camera 2 is 6 cm LEFT of 0."""
     text = "P2: 718.856 0 607.1928 45.38225 0 718.856 185.2157 -0.1130887 0 0 1 0.003779761"
     file = calibration(text)

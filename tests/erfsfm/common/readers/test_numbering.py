@@ -14,7 +14,7 @@ def named(*stems: str) -> list[Path]:
     return [Path(f"{stem}.png") for stem in stems]
 
 
-def test_gaps_and_parts() -> None:
+def test_gaps_and_parts():
     files = by_number(named("000017", "000018", "000021", "000022", "000024"))
     assert (len(files), files.first, files.rows) == (8, 17, (0, 1, 4, 5, 7))
     assert files.gaps() == [(2, 3), (6, 6)]
@@ -39,9 +39,7 @@ def test_gaps_and_parts() -> None:
     ],
     ids=["one a row", "one a number from 0", "one a file", "too many", "too few"],
 )
-def test_rows_of_accompanying_files(
-    values: int, rows: list[int] | None, skipped: int | None
-) -> None:
+def test_rows_of_accompanying_files(values: int, rows: list[int] | None, skipped: int | None):
     assigned = by_number(named("17", "18", "20", "21")).rows_of(values)
     assert (None if assigned is None else (assigned[0].tolist(), assigned[1])) == (
         None if rows is None else (rows, skipped)
@@ -49,7 +47,7 @@ def test_rows_of_accompanying_files(
 
 
 @pytest.mark.parametrize("twin", ["{}_mask", "depth{}", "{}_right"])
-def test_images_of_two_kinds_in_one_folder_are_named(twin: str) -> None:
+def test_images_of_two_kinds_in_one_folder_are_named(twin: str):
     stems = [f"{k:04d}" for k in range(8)]
     both = [stem for k in stems for stem in (k + "_left" * ("right" in twin), twin.format(k))]
     with pytest.raises(DataError, match=r"several images of one number, such as 0000.* and .*0000"):

@@ -43,7 +43,7 @@ def write_video(path: Path, frames: int = FRAMES) -> Path:
 @pytest.mark.parametrize(
     ("suffix", "counted_frames"), [*((suffix, 3000) for suffix in FORMATS), (".avi", 10)]
 )
-def test_any_order_gives_the_right_frame(tmp_path: Path, suffix: str, counted_frames: int) -> None:
+def test_any_order_gives_the_right_frame(tmp_path: Path, suffix: str, counted_frames: int):
     """Also of a long one, whose frames are not counted."""
     frames = VideoFrames(write_video(tmp_path / f"a{suffix}"), counted_frames)
     assert (len(frames), frames.width, frames.height) == (FRAMES, 64, 48)
@@ -51,7 +51,7 @@ def test_any_order_gives_the_right_frame(tmp_path: Path, suffix: str, counted_fr
         assert decoded(frames.read(index)) == index
 
 
-def test_a_name_with_colons_is_no_protocol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_name_with_colons_is_no_protocol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     write_video(tmp_path / "drive.mp4").rename("12:30:05.mp4")
     frames = VideoFrames(Path("12:30:05.mp4"))
@@ -60,7 +60,7 @@ def test_a_name_with_colons_is_no_protocol(tmp_path: Path, monkeypatch: pytest.M
 
 def test_an_uncounted_video_is_decoded_once_in_order(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     called, opened = [], cv2.VideoCapture
 
     class Watched:
@@ -81,7 +81,7 @@ def test_an_uncounted_video_is_decoded_once_in_order(
     assert called.count("grab") == wanted[-1] + 1
 
 
-def test_a_damaged_video_is_one_line_in_a_process_of_its_own(tmp_path: Path) -> None:
+def test_a_damaged_video_is_one_line_in_a_process_of_its_own(tmp_path: Path):
     """The decoder would print lines of its own past Python."""
     path = tmp_path / "a.mp4"
     path.write_bytes(write_video(tmp_path / "b.mp4").read_bytes()[:600])

@@ -49,7 +49,7 @@ def disturbed(
     return moved, X + rng.normal(0.0, 0.05, X.shape)
 
 
-def test_jacobians_are_the_derivatives_of_the_residuals() -> None:
+def test_jacobians_are_the_derivatives_of_the_residuals():
     """Those of depth without the unit of the image: they give the derivative of the cost nevertheless."""
     T, X, sightings = scene(depth_sigma=0.3)
     X = X + np.random.default_rng(4).normal(0.0, 0.1, X.shape)
@@ -74,7 +74,7 @@ def test_jacobians_are_the_derivatives_of_the_residuals() -> None:
 
 
 @pytest.mark.parametrize("points", [60, 700])
-def test_finds_cameras_and_points_again(points: int) -> None:
+def test_finds_cameras_and_points_again(points: int):
     """Of more than are eliminated in one block, too."""
     T, X, sightings = scene(points=points)
     free = np.arange(len(T)) >= 2
@@ -86,7 +86,7 @@ def test_finds_cameras_and_points_again(points: int) -> None:
     assert solved.residual_px.max() < 1e-4
 
 
-def test_is_the_least_squares_solution_and_leaves_fixed_cameras() -> None:
+def test_is_the_least_squares_solution_and_leaves_fixed_cameras():
     T, X, sightings = scene(noise_px=0.5)
     free = np.arange(len(T)) >= 2
     problem = BundleAdjustment(sightings, INTRINSICS, free, robust=1e9)
@@ -102,7 +102,7 @@ def test_is_the_least_squares_solution_and_leaves_fixed_cameras() -> None:
     np.testing.assert_array_equal(solved.T_camera_world[~free], T[~free])
 
 
-def test_wrong_sightings_and_corners_in_a_reflection_move_little() -> None:
+def test_wrong_sightings_and_corners_in_a_reflection_move_little():
     """A quarter of the corners slides to the side."""
     T, X, sightings = scene(noise_px=0.2)
     free = np.arange(len(T)) >= 2
@@ -122,7 +122,7 @@ def test_wrong_sightings_and_corners_in_a_reflection_move_little() -> None:
     assert error(mirror) < 0.1 * error(mirror, robust=1e9)
 
 
-def test_a_turn_has_depth_by_its_prior() -> None:
+def test_a_turn_has_depth_by_its_prior():
     """Where rays have no parallax, depths go to what they are by their prior to each other, and cameras turn."""
     _, X, sightings = scene()
     turns = np.column_stack([np.zeros(6), np.linspace(0.0, 0.1, 6), np.zeros(6)])
@@ -149,7 +149,7 @@ def chain(cameras: int) -> list[Part]:
 
 
 @pytest.mark.parametrize("cameras", [20, 200], ids=["dense", "sparse"])
-def test_the_sum_of_the_parts_is_solved(cameras: int) -> None:
+def test_the_sum_of_the_parts_is_solved(cameras: int):
     parts = chain(cameras)
     S = np.zeros((cameras, 6, cameras, 6))
     for group, part in parts:
@@ -162,6 +162,6 @@ def test_the_sum_of_the_parts_is_solved(cameras: int) -> None:
 
 
 @pytest.mark.parametrize("cameras", [20, 200], ids=["dense", "sparse"])
-def test_a_camera_that_nothing_holds_is_singular(cameras: int) -> None:
+def test_a_camera_that_nothing_holds_is_singular(cameras: int):
     parts = [(group, part) for group, part in chain(cameras) if cameras // 2 not in group]
     assert solve_sum(parts, np.ones((cameras, 6))) is None

@@ -23,7 +23,7 @@ def views() -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_the_reverse_of_a_motion_is_left(sign: float) -> None:
+def test_the_reverse_of_a_motion_is_left(sign: float):
     """Learned depth has no relief, and the first start may go the other way."""
     before, now, depth = views()
     start = np.eye(4)

@@ -30,7 +30,7 @@ def stripes(seed: int) -> Grey:
     )
 
 
-def test_a_bare_wall_shows_how_the_camera_turned() -> None:
+def test_a_bare_wall_shows_how_the_camera_turned():
     """Eleven degrees to the side and three about the view, brighter: only the turn before is known."""
     before = stripes(0)
     R = from_rotation_vector(np.deg2rad([2.0, 11.0, 3.0]), np.zeros(3))[:3, :3]
@@ -66,7 +66,7 @@ def points() -> np.ndarray:
     return rng.uniform((-1.2, -0.9, 4.0), (1.2, 0.9, 6.0), (60, 3))
 
 
-def test_corners_are_moved_to_one_moment(points: np.ndarray) -> None:
+def test_corners_are_moved_to_one_moment(points: np.ndarray):
     now = seen(points)
     truth = ROLLING.project(points)
     assert np.abs(now - truth).max() > 1.5
@@ -76,6 +76,6 @@ def test_corners_are_moved_to_one_moment(points: np.ndarray) -> None:
     assert np.abs(in_middle_row(now, turn, ROLLING) - truth).max() < 0.1
 
 
-def test_without_a_readout_pixels_stay(points: np.ndarray) -> None:
+def test_without_a_readout_pixels_stay(points: np.ndarray):
     pixels = ROLLING.project(points)
     assert np.array_equal(in_middle_row(pixels, TURN, replace(ROLLING, readout_s=0.0)), pixels)

@@ -31,7 +31,7 @@ def along(x: float) -> FloatArray:
     return make(np.eye(3), np.array([x, 0.0, 0.0]))
 
 
-def test_new_points_have_the_unit_of_those_with_parallax() -> None:
+def test_new_points_have_the_unit_of_those_with_parallax():
     """Learned depth is half the depth, by most of the known points, whose parallax is small, the whole depth."""
     points = scene()
     far = np.arange(KNOWN) < 0.6 * KNOWN
@@ -50,7 +50,7 @@ def test_new_points_have_the_unit_of_those_with_parallax() -> None:
     np.testing.assert_array_equal(local.points[:KNOWN], points[:KNOWN])
 
 
-def test_the_first_points_are_at_learned_depth_where_it_is_known() -> None:
+def test_the_first_points_are_at_learned_depth_where_it_is_known():
     points = scene()
     local = LocalMap(points=np.full((TRACKS, 3), np.nan))
     local.add(seen(0, np.eye(4), points, 1.5))
@@ -61,7 +61,7 @@ def test_the_first_points_are_at_learned_depth_where_it_is_known() -> None:
     assert np.isnan(local.points[:11]).all()
 
 
-def test_points_without_parallax_are_uncertain_along_their_first_ray() -> None:
+def test_points_without_parallax_are_uncertain_along_their_first_ray():
     points = scene()
     local = LocalMap(points=points.copy())
     local.add(seen(0, np.eye(4), points, 1.0))
@@ -97,12 +97,12 @@ def unit_after_a_walk(seed: int, keyframes: int = 10) -> float:
     return float(np.linalg.norm(centres[-1] - centres[-2])) / step
 
 
-def test_learned_depth_does_not_move_the_unit_of_a_map() -> None:
+def test_learned_depth_does_not_move_the_unit_of_a_map():
     units = np.log([unit_after_a_walk(seed) for seed in range(20)])
     assert abs(units.mean()) < 0.1
 
 
-def test_adjustment_takes_the_unit_of_loose_points_from_themselves() -> None:
+def test_adjustment_takes_the_unit_of_loose_points_from_themselves():
     """Points that have parallax stay where they are, although learned depth of the others has another unit."""
     points = scene()
     points[KNOWN:] *= 40.0
@@ -114,7 +114,7 @@ def test_adjustment_takes_the_unit_of_loose_points_from_themselves() -> None:
     np.testing.assert_allclose(local.keyframes[-1].T_camera_world, invert(along(0.6)), atol=1e-4)
 
 
-def test_a_step_of_a_sixth_of_the_image_is_followed_by_dense_flow() -> None:
+def test_a_step_of_a_sixth_of_the_image_is_followed_by_dense_flow():
     """A wall 4 m away whose texture has all sizes; corners that left the image are not found."""
     rng = np.random.default_rng(0)
     wall = np.zeros((800, 1200))

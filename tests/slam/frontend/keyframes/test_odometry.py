@@ -19,7 +19,7 @@ def poses(state: KeyframeOdometry) -> KeyframePoses:
     return keyframe_poses(state.segments, room.INTRINSICS)
 
 
-def test_a_hand_held_camera_is_followed() -> None:
+def test_a_hand_held_camera_is_followed():
     truth = room.walk(70)
     state = room.tracked(truth)
     found = poses(state)
@@ -39,7 +39,7 @@ def test_a_hand_held_camera_is_followed() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 5])
-def test_a_map_begins_on_a_plane(seed: int) -> None:
+def test_a_map_begins_on_a_plane(seed: int):
     """A wall faced squarely fits many essential matrices: with seed 5 theirs turned the camera by 90 degrees."""
     truth = room.walk(30)
     T = chained(poses(room.tracked(truth, near=False, draws=seed)).poses)
@@ -51,7 +51,7 @@ def test_a_map_begins_on_a_plane(seed: int) -> None:
     assert np.rad2deg(turned).max() < 1.5
 
 
-def test_blur_of_a_turn_on_the_spot_is_no_motion() -> None:
+def test_blur_of_a_turn_on_the_spot_is_no_motion():
     """Corners of blurred images agree on a translation: without the turn, rotations were 0.6 degrees off."""
     moments = room.walk(152, step_m=0.0, turn=0.005)
     odometry = KeyframeOdometry(room.INTRINSICS)
@@ -66,7 +66,7 @@ def test_blur_of_a_turn_on_the_spot_is_no_motion() -> None:
     assert np.rad2deg(turned).max() < 0.35
 
 
-def test_standing_after_a_walk_adds_no_keyframe_and_does_not_drift() -> None:
+def test_standing_after_a_walk_adds_no_keyframe_and_does_not_drift():
     walked = room.walk(30)
     state = room.tracked(np.concatenate([walked, np.repeat(walked[-1:], 25, axis=0)]))
     keyframes = state.segments[0].keyframes
@@ -78,7 +78,7 @@ def test_standing_after_a_walk_adds_no_keyframe_and_does_not_drift() -> None:
 
 
 @pytest.mark.slow
-def test_another_scene_begins_another_map() -> None:
+def test_another_scene_begins_another_map():
     walked = room.walk(60)
     state = room.tracked(walked, [0] * 25 + [7] * 35)
     found = poses(state)
@@ -91,7 +91,7 @@ def test_another_scene_begins_another_map() -> None:
     assert not any(images[0]) and any(images[1])
 
 
-def test_a_walk_that_begins_with_a_turn_is_one_map() -> None:
+def test_a_walk_that_begins_with_a_turn_is_one_map():
     """A turn of 33 degrees, by 3 a frame: no corner of the first image is left in the end."""
     yaw = np.deg2rad(np.arange(-33.0, 0.0, 3.0))
     turned = from_rotation_vector(np.outer(yaw, [0.0, 1.0, 0.0]), np.zeros((len(yaw), 3)))
@@ -106,7 +106,7 @@ def test_a_walk_that_begins_with_a_turn_is_one_map() -> None:
         assert pose.to_index >= len(yaw) or np.linalg.norm(pose.T_from_to[:3, 3]) < 0.02 * room.FAR
 
 
-def test_without_learned_depth_there_is_no_map() -> None:
+def test_without_learned_depth_there_is_no_map():
     odometry = KeyframeOdometry(room.INTRINSICS)
     for k, T in enumerate(room.walk(6)):
         view = room.frame(k, T)
@@ -118,14 +118,14 @@ def test_without_learned_depth_there_is_no_map() -> None:
     assert [segment.started for segment in odometry.segments] == [False]
 
 
-def test_a_short_move_has_its_length_by_learned_depth() -> None:
+def test_a_short_move_has_its_length_by_learned_depth():
     """A hundredth of the depth is too little parallax for points of their own; learned depth is twice the depth."""
     truth = from_rotation_vector(np.zeros((5, 3)), np.outer(np.arange(5), [0.01, 0.0, 0.0]))
     T = chained(poses(room.tracked(truth, near=False)).poses)
     np.testing.assert_allclose(T[4][:3, 3], [0.08, 0.0, 0.0], atol=0.02)
 
 
-def test_where_no_corner_is_tracked_the_whole_image_gives_the_turn() -> None:
+def test_where_no_corner_is_tracked_the_whole_image_gives_the_turn():
     """Between sharp and blurred images: the camera turns on in the same map."""
     yaw = np.concatenate([np.zeros(5), np.deg2rad(np.arange(1.0, 13.0))])
     truth = from_rotation_vector(np.outer(yaw, [0.0, 1.0, 0.0]), np.zeros((len(yaw), 3)))

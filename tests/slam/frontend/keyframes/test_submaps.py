@@ -68,7 +68,7 @@ def length(part: LocalMap) -> float:
 
 
 @pytest.mark.parametrize(("unit_after", "off"), [(0.85, 0.05), (1.2, 0.05), (3.0, 0.12)])
-def test_a_map_is_cut_where_no_point_carries_the_unit(unit_after: float, off: float) -> None:
+def test_a_map_is_cut_where_no_point_carries_the_unit(unit_after: float, off: float):
     segment = walked(unit_after, learned_sigma=0.02)
     before, after = parts_of(segment, CAMERA)
     assert [k.index for k in after.keyframes] == list(
@@ -80,7 +80,7 @@ def test_a_map_is_cut_where_no_point_carries_the_unit(unit_after: float, off: fl
     )
 
 
-def test_turns_lead_from_one_part_to_the_next() -> None:
+def test_turns_lead_from_one_part_to_the_next():
     parts = parts_of(walked(0.85, learned_sigma=0.0), CAMERA)
     found, truth = keyframe_poses(parts, CAMERA), cameras()
     last, first = parts[0].keyframes[-1].index, parts[1].keyframes[0].index
@@ -99,7 +99,7 @@ def test_turns_lead_from_one_part_to_the_next() -> None:
         assert np.abs(pose.T_from_to[:3, 3] - T_true[:3, 3]).max() < 3.0 * pose.sigmas[3]
 
 
-def test_keyframes_that_share_no_point_are_in_two_parts() -> None:
+def test_keyframes_that_share_no_point_are_in_two_parts():
     segment = walked(1.0, learned_sigma=0.0)
     middle = WALK // 2
     local = LocalMap(segment.keyframes[:WALK], np.tile(segment.points, (2, 1)))
@@ -121,13 +121,13 @@ def test_keyframes_that_share_no_point_are_in_two_parts() -> None:
     ] == pytest.approx(np.deg2rad(0.1))
 
 
-def test_a_map_whose_points_carry_the_unit_is_one_part() -> None:
+def test_a_map_whose_points_carry_the_unit_is_one_part():
     segment = walked(1.0, learned_sigma=0.3)
     (part,) = parts_of(LocalMap(segment.keyframes[:WALK], segment.points, started=True), CAMERA)
     assert [keyframe.index for keyframe in part.keyframes] == list(range(WALK)) and not part.turns
 
 
-def test_a_map_of_one_keyframe_is_one_part() -> None:
+def test_a_map_of_one_keyframe_is_one_part():
     segment = walked(1.0, learned_sigma=0.3)
     alone = LocalMap(segment.keyframes[:1], segment.points, started=True)
     assert [len(part.keyframes) for part in parts_of(alone, CAMERA)] == [1]

@@ -37,7 +37,7 @@ def a_map(unit_m: float, pitch_deg: float, seed: int, see_floor: bool = True) ->
     return LocalMap(keyframes, points @ T_room_map[:3, :3] / unit_m)
 
 
-def test_maps_of_one_floor_have_one_unit() -> None:
+def test_maps_of_one_floor_have_one_unit():
     """Learned depth says 1.2 and 0.9 times the true units; one map sees no floor, one is far from it."""
     true = [0.5, 2.0, 1.0, 1.0]
     maps = [

@@ -38,14 +38,14 @@ def after_steps(steps: int, far: int, near: int, seed: int = 0) -> tuple[DepthEr
     return error, lengths
 
 
-def test_the_bias_over_distance_is_found_and_taken_out() -> None:
+def test_the_bias_over_distance_is_found_and_taken_out():
     error, _ = after_steps(80, far=400, near=200)
     depth = np.array([8.0, 12.0, 50.0, 70.0])
     ratio = error.corrected(biased(depth)) / depth
     np.testing.assert_allclose(ratio / ratio[0], 1.0, atol=0.1)
 
 
-def test_the_curve_has_the_distances_that_were_seen() -> None:
+def test_the_curve_has_the_distances_that_were_seen():
     np.testing.assert_allclose(
         DepthError().corrected(np.array([1.0, 200.0, np.nan])), [1.0, 200.0, np.nan]
     )
@@ -56,14 +56,14 @@ def test_the_curve_has_the_distances_that_were_seen() -> None:
     assert biases[0] - min(biases) > 0.3 and max(sigmas) < 0.3 and min(corners) > 40
 
 
-def test_the_length_does_not_depend_on_how_many_corners_are_far() -> None:
+def test_the_length_does_not_depend_on_how_many_corners_are_far():
     """A road with trees, then a plain: the network's own bias would shorten the steps by a third."""
     for far, near in ((50, 400), (500, 60)):
         _, lengths = after_steps(80, far, near)
         assert np.std(np.log(lengths[20:])) < 0.05
 
 
-def test_moving_objects_in_a_tenth_of_the_corners_leave_the_bias_as_it_is() -> None:
+def test_moving_objects_in_a_tenth_of_the_corners_leave_the_bias_as_it_is():
     rng = np.random.default_rng(1)
     error = DepthError()
     for _ in range(60):
@@ -74,7 +74,7 @@ def test_moving_objects_in_a_tenth_of_the_corners_leave_the_bias_as_it_is() -> N
 
 
 @pytest.mark.parametrize("noise_px", [0.1, 0.3])
-def test_short_steps_do_not_bias_far_depth_nor_widen_its_sigma(noise_px: float) -> None:
+def test_short_steps_do_not_bias_far_depth_nor_widen_its_sigma(noise_px: float):
     """Steps of half a metre past points of 4 to 200 m, whose learned depth scatters by 15 % around its own unit."""
     rng, ahead, focal_px = (
         np.random.default_rng(0),

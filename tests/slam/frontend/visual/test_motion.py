@@ -24,7 +24,7 @@ def triangulated_motion() -> Motion:
     return Motion(pose, np.diag(np.concatenate([ROTATION_SIGMAS, DIRECTION_SIGMAS]) ** 2))
 
 
-def test_another_length_keeps_rotation_and_direction() -> None:
+def test_another_length_keeps_rotation_and_direction():
     motion = triangulated_motion()
     scaled = motion.with_length(1.0, 0.03, 0.09, NO_NOISE)
     np.testing.assert_array_equal(scaled.T_from_to[:3, :3], T_PREVIOUS_CURRENT[:3, :3])
@@ -39,7 +39,7 @@ def test_another_length_keeps_rotation_and_direction() -> None:
     np.testing.assert_array_equal(motion.relative_pose.T_from_to, T_PREVIOUS_CURRENT)
 
 
-def test_further_noise_adds_in_squares_to_that_of_the_corners() -> None:
+def test_further_noise_adds_in_squares_to_that_of_the_corners():
     motion = triangulated_motion()
     own = motion.with_length(2.0, 0.03, 0.09, NO_NOISE).sigmas
     added = np.array([0.01, 0.02, 0.0, 0.05, 0.05, 0.0])
@@ -49,7 +49,7 @@ def test_further_noise_adds_in_squares_to_that_of_the_corners() -> None:
     assert noisier[5] == pytest.approx(own[5], rel=0.02)
 
 
-def test_no_sigma_of_a_translation_is_zero() -> None:
+def test_no_sigma_of_a_translation_is_zero():
     ahead = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 2.0]))
     sigmas = pose_sigmas(ahead, np.concatenate([ROTATION_SIGMAS, [0.004, 0.0, 0.0]]), 0.05)
     np.testing.assert_allclose(sigmas, [*ROTATION_SIGMAS, 0.008, 0.002, 0.1])
@@ -71,7 +71,7 @@ def test_no_sigma_of_a_translation_is_zero() -> None:
 )
 def test_a_path_is_made_of_steps_that_follow_each_other(
     first: int, last: int, path: list[Ends] | None
-) -> None:
+):
     by_start = shortest_by_start([(0, 1), (1, 4), (4, 6), (0, 4)])
     assert path_between(by_start, first, last) == path
 
@@ -89,5 +89,5 @@ def test_a_path_is_made_of_steps_that_follow_each_other(
 )
 def test_links_lead_from_the_first_frame_to_the_last(
     steps: list[Ends], frames: int, found: list[Ends]
-) -> None:
+):
     assert links(steps, frames) == found

@@ -339,7 +339,7 @@ def triangulated(
     return TriangulatedPoints(track_ids, previous, current, np.full(len(track_ids), 0.02))
 
 
-def test_ratio_of_lengths_from_common_points() -> None:
+def test_ratio_of_lengths_from_common_points():
     rng = np.random.default_rng(0)
     depth = rng.uniform(4.0, 20.0, 60)  # metres, in the camera between
     track_ids = np.arange(60)

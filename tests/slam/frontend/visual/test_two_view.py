@@ -316,13 +316,13 @@ def test_a_tangent_and_its_direction_are_orthonormal(direction: list[float]):
     np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-12)
 
 
-def test_a_connected_region_of_one_motion_moves() -> None:
+def test_a_connected_region_of_one_motion_moves():
     seen = np.where(OF_CAR, 0.3 * EXPECTED, EXPECTED)
     moving = moving_corners(PIXELS, PIXELS[:, 1] > 300, ~OF_CAR, OF_CAR, EXPECTED, seen)
     np.testing.assert_array_equal(moving, OF_CAR)
 
 
-def test_the_majority_of_the_parallax_does_not_move() -> None:
+def test_the_majority_of_the_parallax_does_not_move():
     """Learned depth agrees with the far corners, which are many: the near ones are the scene all the same."""
     near = PIXELS[:, 1] > 240
     expected = np.where(near, 8.0, 1.0)
@@ -331,14 +331,14 @@ def test_the_majority_of_the_parallax_does_not_move() -> None:
     assert not moving.any()
 
 
-def test_the_majority_of_the_road_does_not_move() -> None:
+def test_the_majority_of_the_road_does_not_move():
     on_road = OF_CAR | (np.arange(len(PIXELS)) < 10)
     seen = np.where(OF_CAR, 0.3 * EXPECTED, EXPECTED)
     moving = moving_corners(PIXELS, on_road & OF_CAR, ~OF_CAR, OF_CAR, EXPECTED, seen)
     assert not moving.any()
 
 
-def test_corners_that_contradict_each_other_do_not_move() -> None:
+def test_corners_that_contradict_each_other_do_not_move():
     seen = EXPECTED.copy()
     seen[OF_CAR] = EXPECTED[OF_CAR] * np.resize([0.3, 1.7], len(MOVING_CAR))
     moving = moving_corners(PIXELS, np.zeros(len(PIXELS), bool), ~OF_CAR, OF_CAR, EXPECTED, seen)

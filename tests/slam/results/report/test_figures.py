@@ -28,7 +28,7 @@ def area(points: FloatArray, triangles: NDArray[np.int64]) -> float:
 @pytest.mark.parametrize("most", [0, 1_000_000])
 def test_a_thinned_map_keeps_its_surface_and_colours(
     path: Path, monkeypatch: pytest.MonkeyPatch, most: int
-) -> None:
+):
     """By cells first, as a large one, and by quadric errors alone."""
     monkeypatch.setattr(slam.results.report.figures, "_MOST_TRIANGLES", most)
     all_points, all_colours, every = thinned_mesh(path, 100_000)

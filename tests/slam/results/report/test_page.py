@@ -123,7 +123,7 @@ def full(make_run: MakeRun, view: MapView) -> RunFolder:
     return folder
 
 
-def test_a_full_report_is_balanced_and_needs_no_network(full: RunFolder) -> None:
+def test_a_full_report_is_balanced_and_needs_no_network(full: RunFolder):
     html, balance = parsed(full)
     without_data = re.sub(r"[\w+/=]{200,}", "", html)
     assert not re.search(r'https?:|@import|url\(|src="(?!data:)|<link', without_data)
@@ -139,7 +139,7 @@ def test_a_full_report_is_balanced_and_needs_no_network(full: RunFolder) -> None
     assert not list(full.path.glob(".*"))
 
 
-def test_its_plots_have_the_numbers_of_the_run(full: RunFolder) -> None:
+def test_its_plots_have_the_numbers_of_the_run(full: RunFolder):
     html, balance = parsed(full)
     assert [attrs["alt"] for tag, attrs in balance.tags if tag == "img"] == ["Frame 10"]
     found = plots(html)
@@ -175,7 +175,7 @@ def test_its_plots_have_the_numbers_of_the_run(full: RunFolder) -> None:
     assert html.count('id="plotly"') == 1
 
 
-def test_it_shows_the_inputs_of_the_run_escaped(full: RunFolder) -> None:
+def test_it_shows_the_inputs_of_the_run_escaped(full: RunFolder):
     html, balance = parsed(full)
     words = " ".join(balance.words)
     for said in (
@@ -192,7 +192,7 @@ def test_it_shows_the_inputs_of_the_run_escaped(full: RunFolder) -> None:
 
 def test_the_first_sentence_says_how_good_it_is_and_why(
     make_run: MakeRun, make_metrics: MakeMetrics
-) -> None:
+):
     def said(**changed: Any) -> str:
         folder = make_run(metrics=make_metrics() | changed)
         write_report(folder)
@@ -223,7 +223,7 @@ def test_the_first_sentence_says_how_good_it_is_and_why(
     assert "the camera is carried" in unsaid and "of drives" not in unsaid
 
 
-def test_a_map_of_scraps_is_no_success(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
+def test_a_map_of_scraps_is_no_success(make_run: MakeRun, make_metrics: MakeMetrics):
     scraps = make_metrics()["map"] | {
         "triangles": 19908,
         "frames_fused": 40,
@@ -238,7 +238,7 @@ def test_a_map_of_scraps_is_no_success(make_run: MakeRun, make_metrics: MakeMetr
     assert "Map triangles" not in words and "SCRAPS" in words
 
 
-def test_a_leak_is_stamped(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
+def test_a_leak_is_stamped(make_run: MakeRun, make_metrics: MakeMetrics):
     folder = make_run(metrics=make_metrics(leak=True))
     write_report(folder)
     html, _ = parsed(folder)
@@ -247,7 +247,7 @@ def test_a_leak_is_stamped(make_run: MakeRun, make_metrics: MakeMetrics) -> None
 
 def test_without_reference_and_map_the_report_has_the_reasons(
     make_run: MakeRun, make_metrics: MakeMetrics
-) -> None:
+):
     metrics = make_metrics(reference=False, mode="none")
     metrics |= {"map": None, "map_reason": "fusion is switched off"}
     metrics["loops"] = {
@@ -269,7 +269,7 @@ def test_without_reference_and_map_the_report_has_the_reasons(
     )
 
 
-def test_a_failed_run_has_its_reason(make_run: MakeRun) -> None:
+def test_a_failed_run_has_its_reason(make_run: MakeRun):
     metrics = {"schema": 1, "status": "failed", "reason": "frame 7 <is> broken", "provenance": None}
     folder = make_run(metrics=metrics, reference=False)
     for path in folder.path.glob("trajectory_*"):
@@ -281,7 +281,7 @@ def test_a_failed_run_has_its_reason(make_run: MakeRun) -> None:
     assert "FAILED" in html
 
 
-def test_trajectories_without_common_stamps_leave_the_rest_of_the_report(make_run: MakeRun) -> None:
+def test_trajectories_without_common_stamps_leave_the_rest_of_the_report(make_run: MakeRun):
     folder = make_run()
     late = folder.trajectory("odometry")
     folder.write_trajectory("lidar", Trajectory(late.stamps + 1e6, late.T_world_camera))
@@ -297,7 +297,7 @@ def pixels(picture: Picture) -> NDArray[np.uint8]:
     return np.asarray(cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR))
 
 
-def test_lines_join_the_corners_of_the_loop() -> None:
+def test_lines_join_the_corners_of_the_loop():
     first, second = (np.full((64, 208, 3), 128, np.uint8) for _ in range(2))
     camera = Intrinsics(416, 128, 200.0, 200.0, 208.0, 64.0)  # of images twice as large
     corners = np.array([[[104.0, 64.0], [312.0, 32.0]]], np.float32)
@@ -314,7 +314,7 @@ def test_lines_join_the_corners_of_the_loop() -> None:
     assert loop_pictures([loop], {4: first}.get, camera) == []  # the image of a live drive is gone
 
 
-def test_near_is_bright_and_unknown_is_dark() -> None:
+def test_near_is_bright_and_unknown_is_dark():
     pictures, image = DepthPictures(60), np.full((40, 120, 3), 128, np.uint8)
     learned = np.full((40, 120), 50.0, np.float32)
     refined = learned.copy()
@@ -360,7 +360,7 @@ def changed(report: Path, name: str, extra: str) -> Path:
 
 
 @browser
-def test_every_plot_is_drawn_and_nothing_offers_to_send_it(report: Path) -> None:
+def test_every_plot_is_drawn_and_nothing_offers_to_send_it(report: Path):
     page, console = browse(report, "--dump-dom")
     assert console == []
     assert page.count('class="plot"') == page.count('class="modebar-container"') == 5
@@ -370,19 +370,19 @@ def test_every_plot_is_drawn_and_nothing_offers_to_send_it(report: Path) -> None
 
 
 @browser
-def test_the_map_turns_with_the_mouse(report: Path) -> None:
+def test_the_map_turns_with_the_mouse(report: Path):
     page, console = browse(changed(report, "turned.html", DRAG), "--dump-dom")
     assert console == [] and "<title>turned</title>" in page
 
 
 @browser
-def test_a_request_of_the_page_would_be_refused_and_said(report: Path) -> None:
+def test_a_request_of_the_page_would_be_refused_and_said(report: Path):
     picture = '<img alt="" src="http://127.0.0.1:9/picture.png">'
     _, console = browse(changed(report, "asking.html", picture), "--dump-dom")
     assert len(console) == 1 and "Content Security Policy" in console[0]
 
 
-def test_what_is_fixed_to_the_camera_is_red() -> None:
+def test_what_is_fixed_to_the_camera_is_red():
     fixed = np.zeros((30, 40), bool)
     assert not fixed_pictures(np.full((120, 160, 3), 90, np.uint8), fixed)
     fixed[20:] = True

@@ -26,7 +26,7 @@ def quick(kitti_root: Path, tiny_weights: Path, tmp_path: Path) -> dict[str, Any
 
 def test_without_rerun_the_run_does_not_begin(
     quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     find = importlib.import_module
 
     def absent(name: str, *rest: Any) -> Any:
@@ -85,7 +85,7 @@ class Recorder:
 
 def test_everything_is_logged(
     quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     recorder = Recorder()
     for module in ("slam.commands.run", "slam.results.report.rerun"):
         monkeypatch.setattr(f"{module}.import_extra", lambda extra: (recorder,))
@@ -97,7 +97,7 @@ def test_everything_is_logged(
         assert [frame for _, what, frame in recorder.logged if what == kind] == list(range(14))
 
 
-def test_rerun_itself_reads_it(quick: dict[str, Any], tmp_path: Path) -> None:
+def test_rerun_itself_reads_it(quick: dict[str, Any], tmp_path: Path):
     pytest.importorskip("rerun", reason="the extra rerun is not installed")
     run_slam(**quick, rerun=tmp_path / "run.rrd")
     content = (tmp_path / "run.rrd").read_bytes()

@@ -95,10 +95,10 @@ class Parallax:
         """The same by learned depth ``(N,)``: errors that points share do not pull at what rays know."""
         return DEPTH_SIGMA * (1.0 + (DEPTH_SIGMA / self.by_rays(pixel_angle)) ** 2)
 
-    def spread(self, pixel_angle: float) -> FloatArray:
-        """One sigma of each point along its first ray ``(N, 3)``, if rays are known to ``pixel_angle`` radians."""
-        sigma = np.minimum(self.by_rays(pixel_angle), DEPTH_SIGMA)
-        return sigma[:, None] * (self._points - self.centre)
+    def spread(self, pixel_angle: float, rows: TrackIds) -> FloatArray:
+        """One sigma of points of ``M`` rows along their first rays ``(M, 3)``; rays are known to so many radians."""
+        sigma = np.minimum(self.by_rays(pixel_angle)[rows], DEPTH_SIGMA)
+        return sigma[:, None] * (self._points[rows] - self.centre[rows])
 
 
 @dataclass(frozen=True)

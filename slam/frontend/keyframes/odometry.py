@@ -114,7 +114,8 @@ class KeyframeOdometry:
         self._turn_rate = np.zeros(3)  # a second, where the shutter rolls
         self._small: SmallImage = np.zeros((0, 0), np.float32)
         self.events: list[TrackingEvent] = []
-        self._parallax = Parallax(np.zeros((0, 3)))  # of the points of the last keyframe
+        # of the points of the last keyframe, once it is asked for
+        self._known_parallax: Parallax | None = None
         self._relocalises = relocalises
         self._relocaliser: Relocaliser | None = None  # of the lost map
 
@@ -205,7 +206,7 @@ class KeyframeOdometry:
         if segment.keyframes[-1].index != frame.index:
             return
         segment.keyframes[-1] = segment.keyframes[-1].with_depth(depth)
-        self._parallax = segment.add_points(self._intrinsics)
+        self._known_parallax = segment.add_points(self._intrinsics)
         points = int(segment.known(segment.keyframes[-1].track_ids).sum())
         if not segment.started and points >= MIN_POINTS:
             segment.started = True
@@ -261,7 +262,7 @@ class KeyframeOdometry:
         pose = self._resected(segment, track_ids[known], pixels[known])
         if pose is None:
             return False
-        is_settled = self._parallax.settled[track_ids].sum() >= MIN_POINTS
+        is_settled = self._parallax(segment).settled[track_ids].sum() >= MIN_POINTS
         residual_px = float(np.median(pose.residual_px))
         fits = pose.residual_px < (INLIER_PX if is_settled else _DOUBTFUL_PX)
         if not is_doubtful and fits.mean() < 0.5:
@@ -296,6 +297,11 @@ class KeyframeOdometry:
         segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, self._T_camera_world))
         return True
 
+    def _parallax(self, segment: LocalMap) -> Parallax:
+        if self._known_parallax is None:
+            self._known_parallax = segment.parallax(segment.keyframes[-LOOKED_BACK:])
+        return self._known_parallax
+
     def _resected(self, segment: LocalMap, track_ids: TrackIds, pixels: Pixels) -> Resection | None:
         """From the last pose and from the predicted one; None with too few inliers."""
         if len(track_ids) < MIN_POINTS:
@@ -303,7 +309,7 @@ class KeyframeOdometry:
         T_last = self._T_camera_world
         guesses = T_last, self._T_last_step @ T_last
         points = segment.points[track_ids]
-        spread = self._parallax.spread(PIXEL_SIGMA / self._intrinsics.fx)[track_ids]
+        spread = self._parallax(segment).spread(PIXEL_SIGMA / self._intrinsics.fx, track_ids)
         before = np.isin(track_ids, [last.track_ids for last in segment.frames[-1:]])
         trusted = before if before.sum() >= MIN_POINTS else None
         pose = resect(
@@ -366,7 +372,7 @@ class KeyframeOdometry:
             self._T_camera_world = segment.keyframes[-1].T_camera_world
         self._places = segment.keyframes[-1].places.astype(np.float32)
         self._slipped = np.zeros(len(self._places), np.bool_)
-        self._parallax = segment.parallax(segment.keyframes[-LOOKED_BACK:])
+        self._known_parallax = None
 
     def _note(
         self, frame: int, event: Event, other: int | None = None, support: int | None = None

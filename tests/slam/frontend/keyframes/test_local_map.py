@@ -65,10 +65,10 @@ def test_points_without_parallax_are_uncertain_along_their_first_ray():
     points = scene()
     local = LocalMap(points=points.copy())
     local.add(seen(0, np.eye(4), points, 1.0))
-    pixel_angle = 0.7 / CAMERA.fx
-    np.testing.assert_allclose(local.parallax(local.keyframes).spread(pixel_angle), 0.3 * points)
+    asked = 0.7 / CAMERA.fx, np.arange(len(points))
+    np.testing.assert_allclose(local.parallax(local.keyframes).spread(*asked), 0.3 * points)
     local.add(seen(1, along(1.0), points, 1.0))
-    spread = local.parallax(local.keyframes).spread(pixel_angle)
+    spread = local.parallax(local.keyframes).spread(*asked)
     # 0.7 pixels over an angle of some ten degrees
     assert np.linalg.norm(np.cross(spread, points), axis=1).max() < 1e-9
     assert (np.linalg.norm(spread, axis=1) < 0.02 * np.linalg.norm(points, axis=1)).all()

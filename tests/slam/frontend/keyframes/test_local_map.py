@@ -65,7 +65,7 @@ def test_points_without_parallax_are_uncertain_along_their_first_ray():
     points = scene()
     local = LocalMap(points=points.copy())
     local.add(seen(0, np.eye(4), points, 1.0))
-    asked = 0.7 / CAMERA.fx, np.arange(len(points))
+    asked = 0.7 / CAMERA.fx, np.arange(TRACKS)
     np.testing.assert_allclose(local.parallax(local.keyframes).spread(*asked), 0.3 * points)
     local.add(seen(1, along(1.0), points, 1.0))
     spread = local.parallax(local.keyframes).spread(*asked)

@@ -95,8 +95,7 @@ def on_road(inverse_depth: Array, known: NDArray[np.bool_], road: Array) -> NDAr
 
 def _mean_around(mask: NDArray[np.bool_], window: tuple[int, int]) -> Array:
     """Share of the window ``(width, height)`` around each pixel that a mask holds, ``(H, W)``."""
-    share = cv2.blur(mask.astype(np.float32), window, borderType=cv2.BORDER_CONSTANT)
-    return share
+    return cv2.blur(mask.astype(np.float32), window, borderType=cv2.BORDER_CONSTANT)
 
 
 def under_road(inverse_depth: Array, sigma: Array, road: Array) -> NDArray[np.bool_]:

@@ -97,6 +97,8 @@ def evaluate_objective(
     of_snippets = target[len(target) - len(batch.sources) :]
     disparities: list[Tensor] = []
     if needs_depth(config):
+        if not depth_net.training:
+            raise ValueError("the objective needs the depth network in training mode")
         disparities = [disparity.to(precise) for disparity in depth_net(target)]
     pose_vectors = target.new_zeros(len(of_snippets), len(sources), 6)
     if needs_poses(config):

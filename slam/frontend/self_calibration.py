@@ -127,13 +127,15 @@ def check_camera(seen: FollowedCorners, stated: Intrinsics) -> FoundCamera:
     for each so many keyframes.
     """
     told: list[Window | None] = []
+    found = joined(told)
     pairs = seen.keyframe.max(initial=0) // _KEYFRAMES_CHECKED
     for window in windows_that_turn(seen)[: 2 * pairs]:
         longest = np.argsort(-np.bincount(window.point), kind="stable")[:_CHECKED]
         told.append(calibrated(window.chosen(np.isin(window.point, longest), least=2)[0], _FEW))
-        if joined(told).sigmas_from(stated) < _DOUBTFUL:
+        found = joined(told)
+        if found.sigmas_from(stated) < _DOUBTFUL:
             break
-    return joined(told)
+    return found
 
 
 @dataclass(frozen=True)
@@ -235,9 +237,9 @@ def joined(windows: Iterable[Window | None]) -> FoundCamera:
     if sigma > ROUGH:
         sigma = UNKNOWN_FX_SIGMA
         weights = np.array([*(w.sigmas[1] for w in telling), _PRIOR_SIGMAS[1]]) ** -2
-    lens = weights @ lenses / weights.sum()
-    if sigma > ROUGH:
-        lens = _PRIOR + [0, 1, 1, 0, 0] * lens
+        lens = _PRIOR + [0, 1, 1, 0, 0] * (weights @ lenses / weights.sum())
+    else:
+        lens = weights @ lenses / weights.sum()
     log_focal, first, second, x, y = lens.tolist()
     focal = math.exp(log_focal)
     seen = [window.turn_deg for window in telling if np.isfinite(window.sigmas[0])]

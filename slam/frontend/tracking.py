@@ -73,11 +73,9 @@ class Texture(NamedTuple):
     block_px: int
 
 
-# the second is for displacements that remain after the predicted flow, which are small
-STEP_SEARCH, _PREDICTED_SEARCH = (
-    Search(side=11, levels=levels, limits=(30, 0.01), back=None, error_px=0.5, norm=np.inf)
-    for levels in (4, 2)
-)
+STEP_SEARCH = Search(side=11, levels=4, limits=(30, 0.01), back=None, error_px=0.5, norm=np.inf)
+# displacements that remain after the predicted flow are small
+_PREDICTED_SEARCH: Search = STEP_SEARCH._replace(levels=2)
 # OpenCV computes eight columns of a window at once and those that remain one by one: 16 take half
 # the time of 15
 KEYFRAME_SEARCH = Search(

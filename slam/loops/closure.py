@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from erfsfm.common.processes import side_by_side
 from slam.config.sections import LoopsConfig
 from slam.frames import Intrinsics, RelativePose, View
+from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray, invert, path_distance, rotation_angle
 from slam.loops.verification import OF_FRAMES, Loop, LoopThresholds, LoopVerifier, RejectedLoop
 from slam.loops.vocabulary import PlaceIndex
@@ -184,7 +185,7 @@ def _least_path(views: Sequence[View], is_metric: bool) -> float:
         return _LEAST_PATH_M
     depths = np.concatenate([np.zeros(0), *(view.points[:, 2] for view in views)])
     depths = depths[np.isfinite(depths)]
-    return _LEAST_PATH_OVER_DEPTH * float(np.median(depths)) if len(depths) else np.inf
+    return _LEAST_PATH_OVER_DEPTH * median(depths) if len(depths) else np.inf
 
 
 def _counted_once(loops: Sequence[Loop], path: FloatArray, near: float) -> list[Loop]:

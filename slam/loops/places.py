@@ -17,6 +17,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from slam.frames import Intrinsics, View
+from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray, apply, invert
 from slam.loops.verification import LoopThresholds, matches
 from slam.loops.vocabulary import joined
@@ -139,7 +140,7 @@ class PlaceStructure:
         with np.errstate(invalid="ignore", divide="ignore"):  # behind the camera
             errors = np.abs(np.log(np.concatenate(ratios)))
         errors = errors[np.isfinite(errors)]
-        return not len(errors) or float(np.median(errors)) < _LARGEST_DEPTH_ERROR
+        return not len(errors) or median(errors) < _LARGEST_DEPTH_ERROR
 
     def tracks(self) -> Tracks:
         """Corners of all places joined to points that three or more of them see."""

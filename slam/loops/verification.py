@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose, View
 from slam.geometry.multiview import consensus, resect
-from slam.geometry.se3 import FloatArray, apply, invert, make, rotation_angle
+from slam.geometry.robust import median
+from slam.geometry.se3 import FloatArray, apply, invert, length_of, make, rotation_angle
 from slam.loops.features import hamming
 
 _RATIO = 0.85  # largest ratio of nearest to second nearest descriptor distance
@@ -166,7 +167,7 @@ class LoopVerifier:
         difference = forward.T_camera_points @ T_again
         rotation_deg = float(np.rad2deg(rotation_angle(difference[:3, :3])))
         depth = min(forward.depth, scale * backward.depth)
-        translation_ratio = float(np.linalg.norm(difference[:3, 3])) / depth
+        translation_ratio = length_of(difference[:3, 3]) / depth
         if (
             rotation_deg > self.thresholds.agreement_deg
             or translation_ratio > self.thresholds.agreement_ratio
@@ -207,7 +208,7 @@ class LoopVerifier:
         if extent[0] < _MIN_SPREAD_RATIO or extent[1] < _MIN_SPREAD_RATIO / 2:
             return f"{count} inliers in a small part of the image"
         seen = resect([T_start], points_known[inliers], pixels_known[inliers], K)
-        depth = float(np.median(points_known[inliers, 2]))
+        depth = median(points_known[inliers, 2])
         return Sighting(seen.T_camera_world, seen.sigmas, known[inliers], depth)
 
     def _sigmas(
@@ -226,7 +227,7 @@ class LoopVerifier:
         corners = _CORNER_SIGMA_WIDENING * np.hypot(forward, backward)
         rotation = Rotation.from_matrix(difference[:3, :3]).as_rotvec()
         disagreement = np.concatenate([rotation, difference[:3, 3]]) / 2
-        length_sigma = _LENGTH_RELATIVE_SIGMA * float(np.linalg.norm(T_a_b[:3, 3]))
+        length_sigma = _LENGTH_RELATIVE_SIGMA * length_of(T_a_b[:3, 3])
         translation_floor = np.hypot(self.thresholds.translation_floor_ratio * depth, length_sigma)
         floors = np.repeat([np.deg2rad(self.thresholds.rotation_floor_deg), translation_floor], 3)
         return np.linalg.norm([corners, disagreement, floors], axis=0)

@@ -230,7 +230,8 @@ class DepthRefiner:
             nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
             depth = depth[tuple(nearest)]
         T_neighbour_target = invert(self._T_world_camera[chosen]) @ self._T_world_camera[n]
-        images = self._appearance(n), depth, list(map(self._appearance, chosen))
-        refined = self._decide(measure(*images, self._intrinsics.K, T_neighbour_target))
+        target, others = self._appearance(n), [self._appearance(k) for k in chosen]
+        measurement = measure(target, depth, others, self._intrinsics.K, T_neighbour_target)
+        refined = self._decide(measurement)
         refined.relative_sigma[unknown & ~refined.measured] = np.inf
         return refined

@@ -160,7 +160,7 @@ def keyframe_depths(
             sigma[learned == 0] = np.inf
         elif refiner is not None and guess_sigma is not None:
             sigma = np.full_like(depth, guess_sigma)
-        pose, learned = T_world_camera[keyframe.index], learned * np.float32(scale)
-        return KeyframeDepth(keyframe.index, depth, sigma, keyframe.image, pose, learned)
+        pose, of_network = T_world_camera[keyframe.index], learned * np.float32(scale)
+        return KeyframeDepth(keyframe.index, depth, sigma, keyframe.image, pose, of_network)
 
     return depth_at

@@ -427,7 +427,7 @@ class OnnxDepth:
                 f"output {self._output} of {self._path} must be floats of one map (1, 1, H, W) of at most "
                 f"{MOST_PIXELS:,} pixels; got {found.dtype} {found.shape}: choose another with depth.output_name"
             )
-        return found.reshape(sides)
+        return np.asarray(found.reshape(sides), dtype=np.float32)
 
     def _opened(self, content: bytes) -> tuple[onnxruntime.InferenceSession, dict[str, str]]:
         """A graph whose weights are all in its file, ready to run, and its metadata."""

@@ -21,6 +21,7 @@ from slam.geometry.multiview import (
     unit_pose_by_essential,
     unit_poses_by_homography,
 )
+from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray, make
 
 _INLIER_PX = 1.0
@@ -57,7 +58,7 @@ def first_motion(
         triangulated = triangulated_depth(rays_before, rays, motion)
         ahead = triangulated > 0.0
         if ahead.any():
-            unit = float(np.median(depth[ahead] / triangulated[ahead]))
+            unit = median(depth[ahead] / triangulated[ahead])
             at = np.where(ahead, np.clip(unit * triangulated, 0.2 * depth, 5.0 * depth), depth)
             # OpenCV's are less exact
             R = Rotation.from_matrix(motion.R_current_previous).as_matrix()

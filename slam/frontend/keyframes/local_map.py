@@ -20,13 +20,13 @@ from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Sighting
 from slam.frontend.keyframes.image_turn import turned
 from slam.frontend.tracking import KEYFRAME_SEARCH, Pixels, are_inside, track
 from slam.geometry.multiview import PIXEL_SIGMA
-from slam.geometry.robust import weighted_median
+from slam.geometry.robust import median, weighted_median
 from slam.geometry.se3 import FloatArray, apply, invert
 
 TrackIds = NDArray[np.int64]
 
 _IMAGES_KEPT = 20
-LOOKED_BACK = 20  # keyframes between which points of the newest one have parallax
+_LOOKED_BACK = 20  # keyframes between which points of the newest one have parallax
 _MATCHED = KEYFRAME_SEARCH._replace(levels=1)  # guesses are near
 _BORDER_PX = 8
 _LEAST_MATCHED = 8
@@ -204,6 +204,10 @@ class LocalMap:
             )
         return parallax
 
+    def recent_parallax(self) -> Parallax:
+        """Of all points between the last keyframes."""
+        return self.parallax(self.keyframes[-_LOOKED_BACK:])
+
     def add_points(self, intrinsics: Intrinsics) -> Parallax:
         """Points of the newest keyframe's tracks that have none, at learned depth in the unit of the map.
 
@@ -214,7 +218,7 @@ class LocalMap:
         tracks, learned = newest.track_ids, newest.learned_depth
         ratios = self.ratios(newest)
         both, new = ratios > 0.0, ~self.known(tracks) & (learned > 0.0)
-        parallax = self.parallax(self.keyframes[-LOOKED_BACK:])
+        parallax = self.recent_parallax()
         by_rays = parallax.by_rays(PIXEL_SIGMA / intrinsics.fx)[tracks[both]]
         weights = 1.0 / (DEPTH_SIGMA**2 + by_rays**2)
         unit = weighted_median(ratios[both], weights) if both.sum() >= _LEAST_RATIOS else 1.0
@@ -354,7 +358,7 @@ class LocalMap:
         kept = [keyframe for keyframe in self.keyframes if keyframe.grey is not None]
         if not len(known) or not kept:
             return []
-        depth = float(np.median(apply(T_camera_world, self.points[known])[:, 2]))
+        depth = median(apply(T_camera_world, self.points[known])[:, 2])
         poses = np.array([keyframe.T_camera_world for keyframe in kept])
         centres = invert(poses)[:, :3, 3] - invert(T_camera_world)[:3, 3]
         distance = np.linalg.norm(centres, axis=1) / max(depth, 1e-9)

@@ -30,7 +30,6 @@ from slam.frontend.keyframes.image_turn import (
     turned,
 )
 from slam.frontend.keyframes.local_map import (
-    LOOKED_BACK,
     LocalMap,
     NewImage,
     Parallax,
@@ -48,6 +47,7 @@ from slam.geometry.multiview import (
     resect,
     rotation_between,
 )
+from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray, apply, compose, invert, make
 from slam.loops.features import describe
 
@@ -263,7 +263,7 @@ class KeyframeOdometry:
         if pose is None:
             return False
         is_settled = self._parallax(segment).settled[track_ids].sum() >= MIN_POINTS
-        residual_px = float(np.median(pose.residual_px))
+        residual_px = median(pose.residual_px)
         fits = pose.residual_px < (INLIER_PX if is_settled else _DOUBTFUL_PX)
         if not is_doubtful and fits.mean() < 0.5:
             return False
@@ -299,7 +299,7 @@ class KeyframeOdometry:
 
     def _parallax(self, segment: LocalMap) -> Parallax:
         if self._known_parallax is None:
-            self._known_parallax = segment.parallax(segment.keyframes[-LOOKED_BACK:])
+            self._known_parallax = segment.recent_parallax()
         return self._known_parallax
 
     def _resected(self, segment: LocalMap, track_ids: TrackIds, pixels: Pixels) -> Resection | None:
@@ -384,4 +384,4 @@ class KeyframeOdometry:
 
 def _apart(first: Pixels | FloatArray, second: Pixels) -> float:
     """The median distance of pixels ``(M, 2)``."""
-    return float(np.median(np.linalg.norm(first - second, axis=1)))
+    return median(np.linalg.norm(first - second, axis=1))

@@ -17,7 +17,7 @@ from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe, TrackId
 from slam.frontend.keyframes.units import learned_unit, units_by_floor
 from slam.frontend.visual.two_view import CORNER_CORRELATION
 from slam.geometry.multiview import MIN_POINTS, resect
-from slam.geometry.se3 import FloatArray, invert
+from slam.geometry.se3 import FloatArray, invert, length_of
 
 _LEAST_LENGTH = 1e-6
 _RELATIVE_SIGMA = 0.02  # least translation sigma of a factor over the length of its step
@@ -50,8 +50,7 @@ class KeyframePoses:
 
     def is_inside(self, pose: RelativePose) -> bool:
         """Whether both frames of a measurement lie in one connected component of maps."""
-        first, last = pose.ends
-        return self.component.get(first, -1) == self.component.get(last, -2)
+        return _have_one(self.component, *pose.ends)
 
     @property
     def steps(self) -> set[Ends]:
@@ -66,14 +65,14 @@ class KeyframePoses:
         """Whether the frames before ``first`` and the frames from it on have poses in one map."""
         before = max((frame for frame in self.segments if frame < first), default=-1)
         after = min((frame for frame in self.segments if frame >= first), default=-1)
-        return self.segments.get(before, -1) == self.segments.get(after, -2)
+        return _have_one(self.segments, before, after)
 
     def length(self, first: int, last: int) -> float | None:
         """The distance of two frames; None where no map has both."""
-        if self.segments.get(first, -1) != self.segments.get(last, -2):
+        if not _have_one(self.segments, first, last):
             return None
         apart = self.T_map_camera[last][:3, 3] - self.T_map_camera[first][:3, 3]
-        return float(np.linalg.norm(apart))
+        return length_of(apart)
 
     @cached_property
     def T_map_camera(self) -> dict[int, FloatArray]:
@@ -110,11 +109,7 @@ def keyframe_poses(
         turns += [turn.scaled(unit / learned[number]) for turn in segment.turns]
         for ends, loop in _loop_poses(segment, loops, intrinsics, seed).items():
             closing[ends] = loop.scaled(unit)
-    outside = [
-        turn
-        for turn in turns
-        if segments.get(turn.from_index, -1) != segments.get(turn.to_index, -2)
-    ]
+    outside = [turn for turn in turns if not _have_one(segments, *turn.ends)]
     _connect(segments, outside)
     poses += [turn for turn in outside if turn.from_index in segments]
     return KeyframePoses(poses, segments, [closing[ends] for ends in loops])
@@ -126,6 +121,11 @@ def _connect(segments: dict[int, int], turns: Sequence[RelativePose]) -> None:
         for turn in ordered:
             if turn.ends[known] in segments:
                 segments.setdefault(turn.ends[new], segments[turn.ends[known]])
+
+
+def _have_one(numbers: Mapping[int, int], first: int, last: int) -> bool:
+    """Whether both frames have a number, and the same one."""
+    return first in numbers and numbers[first] == numbers.get(last)
 
 
 def _segment_poses(segment: LocalMap, intrinsics: Intrinsics, seed: int) -> list[RelativePose]:
@@ -194,7 +194,7 @@ def _relative(
 ) -> RelativePose:
     """From a keyframe to a later camera; with few points of its own, a keyframe has the least certain sigmas."""
     T_from_to = keyframe.T_camera_world @ invert(T_camera_world)
-    length = float(np.linalg.norm(T_from_to[:3, 3]))
+    length = length_of(T_from_to[:3, 3])
     floors = np.repeat(
         [np.deg2rad(_ROTATION_SIGMA_DEG), _RELATIVE_SIGMA * max(length, _LEAST_LENGTH)], 3
     )

@@ -28,7 +28,8 @@ from slam.frontend.keyframes.local_map import (
 )
 from slam.frontend.keyframes.units import learned_units
 from slam.geometry.multiview import MIN_POINTS
-from slam.geometry.se3 import FloatArray, apply, chain, invert
+from slam.geometry.robust import median
+from slam.geometry.se3 import FloatArray, apply, chain, invert, length_of
 
 logger = logging.getLogger(__name__)
 
@@ -150,7 +151,7 @@ def _pace(keyframes: Sequence[TrackedKeyframe], tied: NDArray[np.bool_]) -> floa
     centres = invert(np.array([keyframe.T_camera_world for keyframe in keyframes]))[:, :3, 3]
     frames = np.diff([keyframe.index for keyframe in keyframes])
     paces = np.linalg.norm(np.diff(centres, axis=0), axis=1)[tied] / frames[tied]
-    return float(np.median(paces)) if len(paces) else 0.0
+    return median(paces) if len(paces) else 0.0
 
 
 def _held(segment: LocalMap, carried: FloatArray) -> LocalMap:
@@ -177,9 +178,9 @@ def _turn(
     """
     T = keyframe.T_camera_world @ invert(T_camera_world)
     learned = keyframe.learned_depth[np.isfinite(keyframe.learned_depth)]
-    depth = float(np.median(learned)) if len(learned) else 1.0
+    depth = median(learned) if len(learned) else 1.0
     if pace is None:
-        sigmas = _ROTATION, _LENGTH * depth + _DEPTH_SIGMA * float(np.linalg.norm(T[:3, 3]))
+        sigmas = _ROTATION, _LENGTH * depth + _DEPTH_SIGMA * length_of(T[:3, 3])
     else:
         T[:3, 3] = 0.0
         sigmas = _IMAGE_ROTATION, _IMAGE_LENGTH * depth + pace * (index - keyframe.index)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import solveh_banded
 
 from slam.frontend.keyframes.local_map import LocalMap
-from slam.geometry.robust import difference_equations, mad_sigma
+from slam.geometry.robust import difference_equations, mad_sigma, median
 from slam.geometry.se3 import FloatArray
 
 _LEAST_DEPTHS = 20
@@ -37,7 +37,7 @@ def learned_unit(local: LocalMap) -> float:
     """Learned depth over depth in the map, the median over all sightings by keyframes; 1 where there are few."""
     joined = np.concatenate([local.ratios(keyframe) for keyframe in local.keyframes])
     known = joined[joined > 0.0]
-    return float(np.median(1.0 / known)) if len(known) >= _LEAST_DEPTHS else 1.0
+    return median(1.0 / known) if len(known) >= _LEAST_DEPTHS else 1.0
 
 
 def learned_units(local: LocalMap, carried: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -51,7 +51,7 @@ def learned_units(local: LocalMap, carried: FloatArray) -> tuple[FloatArray, Flo
         ratios = local.ratios(keyframe)
         known = ratios[ratios > 0.0]
         if len(known) >= _LEAST_DEPTHS:
-            own[row] = -float(np.median(np.log(known)))
+            own[row] = -median(np.log(known))
     if not np.isfinite(own).any():
         return np.ones(len(own)), np.ones(len(own))
     # the scatter of the units of learned depth about that of the map, by keyframes that share no
@@ -142,7 +142,7 @@ def height_above_floor(local: LocalMap, seed: int = 0) -> float | None:
         height = float(normal @ middle)
     below = (points @ normal > (1.0 + _THICKNESS) * height).sum()
     heights_above = height - centres @ normal
-    usual = float(np.median(heights_above))
+    usual = median(heights_above)
     is_level = (
         normal @ down > _LEAST_COSINE * np.linalg.norm(down)
         and np.std(heights_above) < _MOST_SPREAD * usual

@@ -25,7 +25,7 @@ from slam.simulation.street import SimulatedStreet
 from slam.simulation.world import SimulatedWorld
 
 EMBEDDED = SimulationOptions(route="loop", frames=320, seed=640)  # no weights saw it
-_CACHED_FRAMES = 32
+_CACHED_FRAMES = 320  # of the embedded world 50 MB; the look ahead and the run read each frame
 
 
 def simulated_world(options: SimulationOptions) -> SimulatedWorld:

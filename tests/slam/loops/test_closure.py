@@ -36,7 +36,8 @@ class Drive(RecordedSequence):
     def __init__(self, route: str, frames: int, seed: int) -> None:
         street = SimulatedStreet(SimulationOptions(route, 2 * frames, seed, *SIZE))
         self.depth = lambda index: street.depth(2 * index)
-        images = ReadImages(*SIZE, frames, lambda index: street.render(2 * index))
+        render = functools.cache(lambda index: street.render(2 * index))
+        images = ReadImages(*SIZE, frames, render)
         focal_and_centre = street.K[[0, 1, 0, 1], [0, 1, 2, 2]]
         stamps, height_m = 0.2 * np.arange(frames), street.camera_height_m
         poses = street.T_world_camera[::2]

@@ -27,10 +27,7 @@ SETTINGS = ["visual_odometry.enabled=false", "mapping.enabled=false"]
 
 @functools.cache
 def drive() -> SimulatedSequence:
-    sequence = SimulatedSequence(SimulationOptions("loop", FRAMES, 610, 312, 96))
-    # every session needs image and depth of the first frames
-    sequence.street.render = functools.lru_cache(64)(sequence.street.render)
-    return sequence
+    return SimulatedSequence(SimulationOptions("loop", FRAMES, 610, 312, 96))
 
 
 def oracle() -> OraclePredictor:

@@ -96,10 +96,7 @@ class Damaged:
 
 @functools.cache
 def street() -> SimulatedSequence:
-    sequence = SimulatedSequence(SimulationOptions("straight", FRAMES, 1004, 208, 64))
-    # every run needs image and depth of every frame
-    sequence.street.render = functools.lru_cache(FRAMES)(sequence.street.render)
-    return sequence
+    return SimulatedSequence(SimulationOptions("straight", FRAMES, 1004, 208, 64))
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -332,9 +329,7 @@ def test_a_camera_that_moves_too_little_to_be_told_from_the_frame_before_does_no
 
     monkeypatch.setattr(street_world, "plan_route", crawling)
     sequence = SimulatedSequence(SimulationOptions("straight", 2 * FRAMES, 3, 416, 128))
-    remembered = functools.lru_cache(2 * FRAMES)
-    render, depth = remembered(sequence.street.render), remembered(sequence.street.depth)
-    monkeypatch.setattr(sequence.street, "render", render)
+    depth = functools.cache(sequence.street.depth)
     noise = OracleNoise(np.deg2rad(0.1), 0.03, seed=2)
     predictor = OraclePredictor(
         sequence.reference, lambda k: np.where(depth(k) > 0, depth(k), 200.0), noise, FACTOR

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import threading
 from collections import Counter
 from collections.abc import Callable, Collection
@@ -337,9 +336,7 @@ def test_images_without_corners_leave_only_network_factors():
 
 @pytest.fixture(scope="module")
 def street() -> SimulatedSequence:
-    sequence = SimulatedSequence(SimulationOptions("straight", 40, 1002, 208, 64))
-    sequence.street.render = functools.cache(sequence.street.render)
-    return sequence.cut(4, 4 + STREET)
+    return SimulatedSequence(SimulationOptions("straight", 40, 1002, 208, 64)).cut(4, 4 + STREET)
 
 
 def drive_street(

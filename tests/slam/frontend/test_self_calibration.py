@@ -56,6 +56,7 @@ def test_a_straight_street_says_that_it_cannot_be_seen():
     assert "cannot be seen: the camera does not turn" in said and "fov=65 is taken" in said
 
 
+@pytest.mark.slow
 def test_a_lens_is_known_where_the_focal_length_is_not():
     """A straight street through a lens that draws corners in by an eighth; it bends the paths of the points."""
     straight = replace(STREET, route="straight", height=208)

@@ -399,6 +399,7 @@ def test_our_exported_network_gives_the_run_of_our_weights(
     assert (before["depth_source"], before["depth_sha256"]) == ("network", before["weights_sha256"])
 
 
+@pytest.mark.slow
 def test_exact_depth_gives_a_run_of_the_right_scale_in_any_unit(
     world: Path, arrays: Path, tmp_path: Path
 ):

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import shutil
 import tempfile
 import zipfile
 from collections.abc import Callable, Iterable, Sequence
@@ -377,8 +378,9 @@ def scene_of(root: Path, camera: Path, folder: Path) -> Path:
         OSError: no such path.
         DataError: the run or its export fails.
     """
-    scene = folder / _digest(str(camera), [root.resolve()]) / root.stem
+    scene = folder / _digest(str(camera), [root]) / root.stem
     if not (scene / CAMERA_FILE).is_file():  # which comes after the images
+        shutil.rmtree(scene, ignore_errors=True)
         with tempfile.TemporaryDirectory(prefix="erfsfm-camera-") as run:
             words = ["run", "--dataset", str(root), "--camera", str(camera), "--output", run]
             exported = ["export", run, "--what", "nerfstudio", "--output", str(scene)]

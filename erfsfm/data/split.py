@@ -320,7 +320,7 @@ def _without_stops(recordings: list[Recording]) -> list[Recording]:
         else:
             kept += _moving(recording)
     before = sum(map(len, recordings))
-    if (lost := before - sum(map(len, kept))) > 0:
+    if lost := before - sum(map(len, kept)):
         logger.info("left out %d of %d frames in which the camera stands still", lost, before)
     if recordings and not kept:
         raise DataError(

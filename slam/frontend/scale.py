@@ -208,11 +208,12 @@ def find_scale(unit: Unit, drive: Drive, lidar_steps: Sequence[RelativePose] = (
     rows = zip(steps, np.transpose(values).tolist(), strict=True)
     lengths = {ends: StepLength(*row) for ends, row in rows if np.isfinite(row[0])}
     log_speed = running_median(np.log(solved.length / evidence.seconds), _SPEED_STEPS)
-    rows = np.flatnonzero(solved.contradicted)
-    before = np.maximum(rows - _SPEED_STEPS // 2 - 1, 0)
-    after = np.minimum(before + _SPEED_STEPS, len(steps) - 1)
-    leaps = np.nan_to_num(log_speed[after] - log_speed[before]).tolist()
-    contradicted = {steps[row]: leap for row, leap in zip(rows.tolist(), leaps, strict=True)}
+    at = np.flatnonzero(solved.contradicted)
+    # the middles of the windows that end before such a step and begin with it
+    middles = np.add.outer([-_SPEED_STEPS // 2, _SPEED_STEPS // 2], at)
+    around = log_speed[np.clip(middles, 0, len(steps) - 1)]
+    (leaps,) = np.nan_to_num(np.diff(around, axis=0)).tolist()
+    contradicted = {steps[row]: leap for row, leap in zip(at.tolist(), leaps, strict=True)}
     return Scale(unit.mode, estimate, per_frame, lengths, named, contradicted)
 
 

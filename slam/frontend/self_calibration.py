@@ -192,8 +192,7 @@ def windows_that_turn(seen: FollowedCorners) -> list[FollowedCorners]:
     turns = [np.ptp(aside[start : start + count], axis=0).max() for start in starts if count]
     windows = []
     for n in np.argsort(turns)[::-1][:_WINDOWS].tolist():
-        rows = (seen.keyframe >= starts[n]) & (seen.keyframe < starts[n] + count)
-        part, _ = seen.chosen(rows, least=3)
+        part, _ = seen.chosen((seen.keyframe - starts[n]) // count == 0, least=3)
         windows.append(replace(part, keyframe=part.keyframe - starts[n]))
     return windows
 

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from erfsfm.common.errors import TrainingError
 from erfsfm.common.readers.images import read_image
 from erfsfm.common.readers.video import VideoFrames
 from erfsfm.data import many_view_teacher
@@ -84,13 +85,16 @@ def test_the_teacher_gets_the_frames_of_a_part_as_images(tmp_path, monkeypatch):
             output / "trajectory_optimised.kitti.txt",
             np.tile(np.eye(4)[:3].ravel(), (len(numbers), 1)),
         )
-        (output / "metrics.json").write_text(json.dumps({"scale": {"unit": "metres"}}))
+        unit = "metres" if len(numbers) == 4 else "the networks' own unit"
+        (output / "metrics.json").write_text(json.dumps({"scale": {"unit": unit}}))
         return ""
 
     monkeypatch.setattr(many_view_teacher, "slam_process", slam)
     teacher = ManyViewTeacher(tmp_path / "measured", (16, 24), stride=2, with_depth=False)
     teacher.prepare([whole.part(20, 24)], 2, "sim", lambda *_: None)
     assert numbers == [20, 21, 22, 23]
+    with pytest.raises(TrainingError, match="no road was found"):
+        teacher.prepare([whole.part(30, 33)], 2, "sim", lambda *_: None)
 
 
 def test_a_video_that_was_cut_off(tmp_path, caplog):

@@ -63,7 +63,7 @@ def train(
     ] = None,
     camera: Annotated[
         Path | None,
-        typer.Option(help="camera.yaml of images and videos, in place of the one beside them"),
+        typer.Option(help="camera.yaml of images and videos, for that beside them; auto finds it"),
     ] = None,
     output: Annotated[Path, typer.Option(help="receives weights, checkpoints and logs")] = Path(
         "runs/train"

@@ -93,11 +93,7 @@ def slam_process(
             process.kill()
             process.wait()
         said.seek(max(said.seek(0, os.SEEK_END) - _MOST_SAID, 0))
-        lines = [
-            line.strip()
-            for line in said.read().decode(errors="replace").splitlines()
-            if line.strip()
-        ]
+        lines = said.read().decode(errors="replace").strip().splitlines()
     code = process.returncode
     if exceeded or code == 0:
         return exceeded

@@ -71,9 +71,8 @@ def discover(root: Path, camera: Path | None = None) -> list[Recording]:
         )
         raise DataError(
             f"no recording in {root}: wanted a KITTI odometry root (sequences/NN/image_2), KITTI raw drives "
-            "(2011_09_26/..._sync/image_02), images or a video with camera.yaml (erfsfm-slam run finds it, erfsfm-slam "
-            f"export --what nerfstudio writes both), or a prepared folder ({INDEX_FILE}); found "
-            f"{entries or 'an empty folder'}"
+            "(2011_09_26/..._sync/image_02), images or a video with camera.yaml (train --camera auto finds it), or a "
+            f"prepared folder ({INDEX_FILE}); found {entries or 'an empty folder'}"
         )
     return found
 

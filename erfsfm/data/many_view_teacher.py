@@ -3,13 +3,15 @@
 The SLAM system gives the poses. All of it is kept in a folder under a digest of the drive's images and
 camera, so that it is computed once. In a prepared folder a label is a small picture
 (`erfsfm.data.label_file`). The networks' package does not import the SLAM system: what goes between
-them are a folder of images and a trajectory.
+them are folders of images with their camera, and a trajectory.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import logging
+import shutil
 import tempfile
 import zipfile
 from collections.abc import Callable, Iterable, Sequence
@@ -27,6 +29,7 @@ from erfsfm.common.errors import DataError, TrainingError
 from erfsfm.common.files import FolderLock, write_atomically
 from erfsfm.common.processes import limit_library_threads, processes, slam_process
 from erfsfm.common.progress import Progress
+from erfsfm.common.readers.camera_file import CAMERA_FILE, read_camera_file
 from erfsfm.common.readers.video import VideoFrames
 from erfsfm.data.label_file import decode
 from erfsfm.data.recordings import Recording
@@ -35,6 +38,8 @@ from erfsfm.geometry import Camera
 from erfsfm.labels.flow_labels import NEIGHBOURS, label, measure
 from erfsfm.labels.refined_labels import in_camera_heights, refined_label, shrunk
 from erfsfm.mvs.views import Grey, neighbours_around
+
+logger = logging.getLogger(__name__)
 
 VERSION = 4
 # pixels of the images that flow alone measures: finer flow is slower and no surer; twice the networks' width would
@@ -140,17 +145,14 @@ class DriveLabels:
                     )
             camera = asdict(recording.camera) | {"fps": _FPS, "camera_height_m": _CAMERA_HEIGHT_M}
             (drive / "camera.yaml").write_text(yaml.safe_dump(camera))
-            where = "--dataset", str(drive), "--output", str(output)
-            reason = slam_process(["run", *where, "--weights", weights, *_RUN.split()])
-            if reason or not (output / _TRAJECTORY).is_file():
-                raise TrainingError(
-                    f"the teacher's poses of {name} could not be found: {reason or 'it wrote none'}"
-                )
+            words = ["run", "--dataset", str(drive), "--output", str(output), "--weights", weights]
+            if reason := slam_process(words + _RUN.split()):
+                raise TrainingError(f"the teacher's poses of {name} could not be found: {reason}")
             rows = np.loadtxt(output / _TRAJECTORY).reshape(-1, 3, 4)
-            mode = json.loads((output / "metrics.json").read_text())["scale"]["mode"]
-        if mode != "camera-height":
+            unit = json.loads((output / "metrics.json").read_text())["scale"]["unit"]
+        if unit != "metres":
             raise TrainingError(
-                f"the teacher's poses of {name} have no scale: no road was found (scale mode {mode})"
+                f"the teacher's poses of {name} have no scale: no road was found (lengths in {unit})"
             )
         T_world_camera = np.tile(np.eye(4), (len(rows), 1, 1))
         T_world_camera[:, :3] = rows
@@ -234,12 +236,8 @@ class DriveLabels:
 
     def _greys(self, frames: Iterable[int], camera: Camera) -> dict[int, Grey]:
         """Those frames that can be read."""
-        greys = {}
-        for n in frames:
-            image = self._image(n, camera)
-            if image is not None:
-                greys[n] = _grey(image)
-        return greys
+        read = {n: self._image(n, camera) for n in frames}
+        return {n: _grey(image) for n, image in read.items() if image is not None}
 
     def _motion(self, target: int, others: Iterable[int]) -> NDArray[np.float64]:
         """``T_other_target`` ``(N, 4, 4)``."""
@@ -291,12 +289,9 @@ class ManyViewTeacher:
                 )
             else:
                 # of the camera, the names, sizes and times of the images, and the version of this file
-                seen = [f"{VERSION} {recording.camera} {recording.start} {len(recording)}"]
-                for path in sorted(set(recording.images)):
-                    stat = path.stat()
-                    seen.append(f"{path.name} {stat.st_size} {stat.st_mtime_ns}")
-                digest = hashlib.sha256("\n".join(seen).encode()).hexdigest()[:_DIGITS]
-                drive = DriveLabels(recording, self._folder / digest, self._size, self._stride)
+                seen = f"{VERSION} {recording.camera} {recording.start} {len(recording)}"
+                folder = self._folder / _digest(seen, sorted(set(recording.images)))
+                drive = DriveLabels(recording, folder, self._size, self._stride)
             self._drives[recording.key] = drive
         return self._drives[recording.key]
 
@@ -369,6 +364,38 @@ class ManyViewTeacher:
                     for future in as_completed(running):
                         done += future.result()
                         progress("teacher: depth", done, total)
+
+
+def scene_of(root: Path, camera: Path, folder: Path) -> Path:
+    """Images of a recording without distortion, with the camera and the mask that a run finds, made once in ``folder``.
+
+    Args:
+        root: images or a video.
+        camera: ``auto``, and what else is known of it, for the run.
+        folder: of all that is measured.
+
+    Raises:
+        OSError: no such path.
+        DataError: the run or its export fails.
+    """
+    scene = folder / _digest(str(camera), [root]) / root.stem
+    if not (scene / CAMERA_FILE).is_file():  # which comes after the images
+        shutil.rmtree(scene, ignore_errors=True)
+        with tempfile.TemporaryDirectory(prefix="erfsfm-camera-") as run:
+            words = ["run", "--dataset", str(root), "--camera", str(camera), "--output", run]
+            exported = ["export", run, "--what", "nerfstudio", "--output", str(scene)]
+            if reason := slam_process(words + _RUN.split()) or slam_process(exported):
+                raise DataError(f"the camera of {root} could not be found: {reason}")
+            logger.warning("%s: %s", root, read_camera_file(Path(run) / CAMERA_FILE).source)
+    return scene
+
+
+def _digest(seen: str, files: Iterable[Path]) -> str:
+    """Of what was ``seen``, and of the names, sizes and times of files."""
+    for path in files:
+        stat = path.stat()
+        seen += f"\n{path.name} {stat.st_size} {stat.st_mtime_ns}"
+    return hashlib.sha256(seen.encode()).hexdigest()[:_DIGITS]
 
 
 def _grey(image: NDArray[np.uint8]) -> Grey:

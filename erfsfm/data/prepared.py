@@ -140,7 +140,7 @@ def write_prepared(
                 name=recording.name,
                 start=recording.start,
                 frames=len(recording),
-                camera=recording.camera.resized(network.width, network.height, network.fidelity),
+                camera=recording.seen_by(network),
                 camera_height_m=recording.camera_height_m,
             )
             for recording in recordings

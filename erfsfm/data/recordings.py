@@ -19,7 +19,7 @@ from erfsfm.common.errors import DataError
 from erfsfm.common.readers.images import Image, read_depth_map, read_image, resize_image
 from erfsfm.common.readers.numbering import NumberedFiles
 from erfsfm.common.readers.video import VideoFrames
-from erfsfm.config import Fidelity
+from erfsfm.config import Fidelity, NetworkConfig
 from erfsfm.geometry import Camera
 
 logger = logging.getLogger(__name__)
@@ -143,6 +143,10 @@ class Recording:
         image = read_image(stored)
         self._require_size(stored, *image.shape[:2])
         return resize_image(image, height, width)
+
+    def seen_by(self, network: NetworkConfig) -> Camera:
+        """The camera of images at a network's size."""
+        return self.camera.resized(network.width, network.height, network.fidelity)
 
     def fixed(self, height: int, width: int) -> NDArray[np.bool_]:
         """Where the images, resized, show what is fixed to the camera ``(height, width)``; nowhere without a mask."""

@@ -32,7 +32,6 @@ from erfsfm.data.window import (
     load_window,
     snippet_motion,
 )
-from erfsfm.geometry import Camera
 
 _VALIDATED = 40  # snippets: as many as the shipped weights were chosen by
 # what the simulator leaves unknown is sky; of a depth camera it may be anywhere
@@ -66,7 +65,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
             config.data.cache_mb - depth_mb - (0 if many_views is None else labels_mb(config.data))
         )
         self._cache = ArrayCache(images_mb, (*size, 3), np.uint8)
-        self._unreadable: set[str] = set()
+        self._unreadable = set[str]()
         self._depth = ArrayCache(
             depth_mb, size, np.float32
         )  # true depth, inverse depth that is imitated
@@ -75,9 +74,8 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         length = config.network.sources + 1
         self.recordings = usable(recordings, length)
         # by their masks; empty where none has one
-        self._fixed: dict[Path | None, NDArray[np.bool_]] = {}
-        if any(recording.mask for recording in self.recordings):
-            self._fixed = {each.mask: each.fixed(*size) for each in self.recordings}
+        has_mask = any(recording.mask for recording in self.recordings)
+        self._fixed = {each.mask: each.fixed(*size) for each in self.recordings if has_mask}
         self._exact, self._measured = by_label(self.recordings, config)
         weights = config.data.weights
         names = list(dict.fromkeys(recording.name for recording in self.recordings))
@@ -116,22 +114,20 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         if self._exact and number % training.batch < training.of_batch(self._config.data.exact):
             recording = self._exact[int(rng.choice(len(self._exact), p=self._exact_probabilities))]
             index = int(rng.integers(len(recording)))
-            bounds, camera = self._exact_labels.bounds(recording, index), self._camera(recording)
+            bounds, camera = (
+                self._exact_labels.bounds(recording, index),
+                recording.seen_by(self._config.network),
+            )
             (image,) = load_window(self._cache, Snippet(recording, index), 1)
             return single_image(image, camera, bounds, self._config, rng)
         snippet, images = first_readable(self._chosen(rng), self._images, self._unreadable)
-        camera = self._camera(snippet.recording)
+        camera = snippet.recording.seen_by(self._config.network)
         seen = self._known(snippet)
         if self._config.single_images:
             assert seen is not None, "there are labels"
             return single_image(images[0], camera, (seen.least, seen.most), self._config, rng)
         fixed = self._fixed.get(snippet.recording.mask)
         return training_sample(images, camera, seen, self._config, rng, fixed)
-
-    def _camera(self, recording: Recording) -> Camera:
-        """At the networks' size."""
-        network = self._config.network
-        return recording.camera.resized(network.width, network.height, network.fidelity)
 
     def _images(self, snippet: Snippet) -> list[NDArray[np.uint8]]:
         """Those of a sample in time order: the snippet's, or its target alone."""
@@ -193,7 +189,9 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         inverse_depth = cv2.resize(
             self._imitated(image), (width, height), interpolation=cv2.INTER_AREA
         )
-        return in_heights(np.asarray(inverse_depth), self._camera(recording), self._config)
+        return in_heights(
+            np.asarray(inverse_depth), recording.seen_by(self._config.network), self._config
+        )
 
 
 class ValidationSnippets(Dataset[dict[str, Tensor]]):
@@ -214,8 +212,8 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
             for first in range(len(recording) - length + 1):
                 windows.append(Snippet(recording, first))
         chosen = np.linspace(0, len(windows) - 1, min(_VALIDATED, len(windows)))
-        self.snippets: list[Snippet] = []
-        reasons: list[str] = []
+        self.snippets = list[Snippet]()
+        reasons = list[str]()
         for i in chosen.round():
             snippet = windows[int(i)]
             try:
@@ -232,9 +230,7 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
         snippet, network = self.snippets[item], self._network
         recording = snippet.recording
         images, depth = self._read(snippet)
-        sample = as_tensors(
-            images, recording.camera.resized(network.width, network.height, network.fidelity).K
-        )
+        sample = as_tensors(images, recording.seen_by(network).K)
         if depth is not None:
             sample["depth"] = torch.from_numpy(depth)
         T_world_camera = recording.true_poses()
@@ -312,11 +308,8 @@ def by_label(
         DataError: exact depth is wanted, and recordings lack it, or all have it and a mixture is
             wanted.
     """
-    exact: list[Recording] = []
-    measured: list[Recording] = []
-    for recording in recordings:
-        kind = exact if recording.exact else measured
-        kind.append(recording)
+    exact = [recording for recording in recordings if recording.exact]
+    measured = [recording for recording in recordings if not recording.exact]
     if config.teacher.exact and measured:
         raise DataError(
             f"teacher.views=exact needs the true depth of every recording; {measured[0].name} has none: simulate with "

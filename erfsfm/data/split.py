@@ -22,6 +22,7 @@ from erfsfm.common.errors import DataError
 from erfsfm.common.readers.frame_range import EVERYTHING, KINDS, FrameRange
 from erfsfm.config import EIGEN, DataConfig, config_folders
 from erfsfm.data.discovery import discover
+from erfsfm.data.many_view_teacher import scene_of
 from erfsfm.data.recordings import Recording
 from erfsfm.data.standstill import moving_parts
 
@@ -50,11 +51,7 @@ class Split(Section):
     @property
     def test_recordings(self) -> list[str]:
         """Recordings with a frame to test on, without their frames."""
-        recordings = []
-        for name in self.test:
-            match = _FRAMES.fullmatch(name.strip())
-            recordings.append(name.strip() if match is None else match["recording"])
-        return recordings
+        return [name.partition("[")[0].strip() for name in self.test]
 
     def test_frames(self) -> list[tuple[str, int]]:
         """Every single frame to test on: its recording and number.
@@ -116,7 +113,7 @@ def usable(recordings: Sequence[Recording], length: int) -> list[Recording]:
 
 
 def split_recordings(
-    config: DataConfig, camera: Path | None = None
+    config: DataConfig, camera: Path | None = None, folder: Path = Path()
 ) -> tuple[list[Recording], list[Recording]]:
     """Training and validation recordings of all roots.
 
@@ -124,7 +121,9 @@ def split_recordings(
 
     Args:
         config: that names the roots.
-        camera: the camera file of a user's images and videos, in place of those beside them.
+        camera: the camera file of a user's images and videos, in place of those beside them; ``auto``
+            is found by a run.
+        folder: keeps what such a run gives.
 
     Raises:
         DataError: no roots, a name that fits no recording or kind of recordings, a range that begins
@@ -133,14 +132,12 @@ def split_recordings(
     """
     if not config.roots:
         raise DataError("no data to train on: name data sets with --dataset ROOT or data.roots")
-    if camera is not None and str(camera).startswith("auto"):
-        raise DataError(
-            "--camera auto finds the camera of a run: erfsfm-slam run --dataset DATA --output RUN, then erfsfm-slam "
-            "export RUN --what nerfstudio --output SCENE, and train on SCENE"
-        )
     split = read_split_file(config.split) if config.split else Split()
     division = _Division(config, split)
-    found = [each for root in config.roots for each in discover(root, camera)]
+    roots = config.roots
+    if camera and str(camera).startswith("auto"):
+        roots, camera = [scene_of(root, camera, folder) for root in roots], None
+    found = [each for root in roots for each in discover(root, camera)]
     if camera is not None and not any(each.name.startswith("folder/") for each in found):
         raise DataError(f"--camera {camera} is for images and videos of your own: leave it out")
     division.require_found(found)
@@ -152,7 +149,7 @@ def split_recordings(
             training += _rest(part, division.forbidden(recording))
     if not training:
         raise DataError(
-            f"nothing left to train on: every recording found ({_names(found)}) is excluded or used "
+            f"nothing left to train on: every recording found ({_lengths(found)}) is excluded or used "
             "to validate or test; see data.exclude, data.validation and data.split"
         )
     if config.validation_share > 0:
@@ -160,8 +157,9 @@ def split_recordings(
         validation += ends
     if not validation:
         _require_none_wanted(config, split, found)
-    if config.validation != _DEFAULT_VALIDATION:
-        _warn_of_absent(config.validation, found)
+    absent = [name for name in config.validation if not _is_found(FrameRange.parse(name), found)]
+    if absent and config.validation != _DEFAULT_VALIDATION:
+        logger.warning("data.validation names %s, which is not among the data", _some(absent))
     return _without_stops(training), _without_stops(validation)
 
 
@@ -179,7 +177,6 @@ class _Division:
     def __init__(self, config: DataConfig, split: Split) -> None:
         left_out = read_split_file(EIGEN).test_recordings if EIGEN in config.exclude else []
         self.scenes = _parsed(left_out)
-        self.keys = list(config.ranges)
         self.ranges = _parsed(f"{key}[{span}]" for key, span in config.ranges.items())
         self.listed = _parsed(split.train)
         self.held_out = _parsed((*config.validation, *split.validation))
@@ -193,11 +190,11 @@ class _Division:
 
     def require_found(self, found: Sequence[Recording]) -> None:
         """Refuse ranges of recordings that are not there, or that are shorter."""
-        for key, each in zip(self.keys, self.ranges):
+        for each in self.ranges:
             if not _is_found(each, found):
                 raise DataError(
-                    f"data.ranges names '{key}', but no recording has that name; "
-                    f"found {_names(found)}"
+                    f"data.ranges names '{each}', but no recording has that name; "
+                    f"found {_lengths(found)}"
                 )
         _require_begun(found, [*self.ranges, *self.listed, *self.held_out])
 
@@ -222,10 +219,6 @@ def _is_found(frames: FrameRange, found: Sequence[Recording]) -> bool:
     return any(frames.counted_in(recording.name) is not None for recording in found)
 
 
-def _names(recordings: Sequence[Recording]) -> str:
-    return _some([recording.name for recording in recordings])
-
-
 def _require_none_wanted(config: DataConfig, split: Split, found: Sequence[Recording]) -> None:
     """Refuse an empty validation where the configuration or its split name one."""
     is_named = split.validation or config.validation != _DEFAULT_VALIDATION
@@ -233,14 +226,8 @@ def _require_none_wanted(config: DataConfig, split: Split, found: Sequence[Recor
         wanted = _some([*config.validation, *split.validation])
         raise DataError(
             f"nothing to validate on: data.validation and data.split name {wanted}; found "
-            f"{_names(found)}; name one of these, or train without validation by data.validation=[]"
+            f"{_lengths(found)}; name one of these, or train without validation by data.validation=[]"
         )
-
-
-def _warn_of_absent(names: Sequence[str], found: Sequence[Recording]) -> None:
-    absent = [name for name in names if not _is_found(FrameRange.parse(name), found)]
-    if absent:
-        logger.warning("data.validation names %s, which is not among the data", _some(absent))
 
 
 def _ends_split_off(
@@ -333,7 +320,7 @@ def _without_stops(recordings: list[Recording]) -> list[Recording]:
         else:
             kept += _moving(recording)
     before = sum(map(len, recordings))
-    if (lost := before - sum(map(len, kept))) > 0:
+    if lost := before - sum(map(len, kept)):
         logger.info("left out %d of %d frames in which the camera stands still", lost, before)
     if recordings and not kept:
         raise DataError(

@@ -37,6 +37,7 @@ _BEGUN = {
     "logs",
     "last",
     "best_pose",
+    MEASUREMENTS,
 }  # left by a run that failed before its first weights
 _TIMED_STEPS, _TIMED_S = 20, 30.0  # whichever comes first
 
@@ -64,9 +65,7 @@ class OutputFolder:
             raise TrainingError(
                 f"{self.path} holds a run already: continue with --resume or choose another --output"
             )
-        names = {entry.name for entry in self.path.iterdir() if ".partial." not in entry.name} - {
-            MEASUREMENTS
-        }
+        names = {entry.name for entry in self.path.iterdir() if ".partial." not in entry.name}
         foreign = sorted(names - _BEGUN)
         if foreign:
             raise TrainingError(

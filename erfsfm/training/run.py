@@ -77,7 +77,7 @@ def train(
         device: ``auto``, ``cpu`` or ``cuda``.
         command: recorded in the weights.
         progress: told of the stage, what is done, and of how many.
-        camera: the camera file of a user's images and videos, in place of those beside them.
+        camera: the camera file of a user's images and videos, in place of those beside them; ``auto`` finds it.
 
     Raises:
         ConfigError, DataError, TrainingError: configuration, data or output folder cannot be used; one line.
@@ -93,7 +93,8 @@ def train(
     done_steps = folder.resumable_steps(config) if resume else 0
     if rank == 0 and not resume:  # the first process has written there before it starts the others
         folder.require_free()
-    training, validation = split_recordings(config.data, camera)
+    measured = config.teacher.cache or output / MEASUREMENTS
+    training, validation = split_recordings(config.data, camera, measured)
     if config.data.validation and not validation and rank == 0:
         logger.warning(
             "training runs without validation: no recording of data.validation is among the data"
@@ -103,7 +104,7 @@ def train(
         timedelta(minutes=config.training.minutes) or None, verbose=False
     )  # keeps its time in checkpoints
     module, workers = SelfSupervision(config, timer.time_elapsed), _workers(config)
-    draws = _draws(config, training, done_steps, output, progress)
+    draws = _draws(config, training, done_steps, measured, progress)
     validation_loader = (
         DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     )
@@ -148,13 +149,12 @@ def prepare(
         raise ConfigError(
             "--prepare keeps whole recordings to validate on: set data.validation_share=0"
         )
-    training, validation = split_recordings(config.data, camera)
-    training = usable(training, config.network.sources + 1)
-    held_out = ValidationSnippets(validation, config).snippets if validation else []
     with tempfile.TemporaryDirectory() as temporary:
-        teacher = measured_views(
-            training, config, config.teacher.cache or Path(temporary), progress
-        )
+        measured = config.teacher.cache or Path(temporary)
+        training, validation = split_recordings(config.data, camera, measured)
+        training = usable(training, config.network.sources + 1)
+        held_out = ValidationSnippets(validation, config).snippets if validation else []
+        teacher = measured_views(training, config, measured, progress)
         write_prepared(output, training, held_out, teacher, config.network, progress)
 
 
@@ -177,8 +177,8 @@ def depth_before_and_after(
     Raises:
         DataError, TrainingError: no depth could be measured there.
     """
-    _, validation = split_recordings(config.data, camera)
     cache, rows = config.teacher.cache or output / MEASUREMENTS, []
+    _, validation = split_recordings(config.data, camera, cache)
     for when, weights in (("before", config.initial_weights), ("after", str(output))):
         networks = DepthPosePredictor.from_weights(weights, device)
         errors = many_view_protocol(networks, validation, cache, True, progress)
@@ -214,14 +214,12 @@ def _draws(
     config: ExperimentConfig,
     training: list[Recording],
     done_steps: int,
-    output: Path,
+    measured: Path,
     progress: Progress,
 ) -> SnippetDraws:
     """What this process trains on after some steps."""
     together = config.training.batch * config.training.devices
-    views = measured_views(
-        training, config, config.teacher.cache or output / MEASUREMENTS, progress
-    )
+    views = measured_views(training, config, measured, progress)
     last, done = config.training.steps * together, done_steps * together
     imitates = config.teacher.views == "network"
     imitated = partial(learned_inverse_depth, config.teacher.slam_weights) if imitates else None

@@ -244,9 +244,9 @@ def _write_scene(
     if cloud is not None:
         write_ply(output / POINTS, cloud)
         scene["ply_file_path"] = POINTS
-    poses = {k: (trajectory.T_world_camera[k] @ _T_CAMERA_OPENGL).tolist() for k in frames}
+    poses = (trajectory.T_world_camera[frames] @ _T_CAMERA_OPENGL).tolist()
     scene["frames"] = [
-        {"file_path": _image_name(k), "transform_matrix": pose} for k, pose in poses.items()
+        {"file_path": _image_name(k), "transform_matrix": pose} for k, pose in zip(frames, poses)
     ]
     text = json.dumps(scene, indent=2, allow_nan=False) + "\n"
     write_atomically(output / TRANSFORMS, text, RunError)

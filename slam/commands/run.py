@@ -381,8 +381,7 @@ def open_recording(request: RunRequest) -> RecordedSequence:
     try:
         recording = open_or_embedded(*place, asked, request.frames, request.truth)
     except MissingCameraError:
-        asked = AUTO
-        recording = open_or_embedded(*place, asked, request.frames, request.truth)
+        return open_recording(request.model_copy(update={"camera": AUTO}))
     camera = recording.camera
     if asked is None or not is_auto(asked) or not isinstance(camera, CameraFile):
         return recording

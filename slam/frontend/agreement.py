@@ -35,9 +35,9 @@ _LEAST = 5  # compared values
 # of good drives (docs/reliability.md): mean and spread
 _USUAL_SUPPORT, _SUPPORT_SPREAD = 0.6, 0.13
 _WEAK_SUPPORT, _LEAST_WEAK = 0.2, 10  # and frames in a row that are a doubt
-_ON_ROAD, _ON_ROAD_SPREAD = 1.0, 0.2
+_ON_ROAD_SPREAD = 0.2
 _FAR_SPREAD = 0.18  # of the logarithm
-_CONTRADICTED_SPREAD = 0.007
+_CONTRADICTED_SPREAD, _LEAP_SPREAD = 0.007, 0.1
 _LEAST_MOVED = 0.1  # of long steps
 _LEAST_APART = 0.1  # between poses whose directions are compared: shorter steps are noise
 _ALONG = np.cos(np.deg2rad(20.0))  # of the directions of steps
@@ -194,14 +194,14 @@ def of_depth(source: str, error: DepthError) -> Agreement | None:
 
 
 def of_images(
-    drive: Drive, camera: Intrinsics, contradicted: Sequence[Ends], needs_road: bool
+    drive: Drive, camera: Intrinsics, contradicted: Mapping[Ends, float], needs_road: bool
 ) -> list[Agreement]:
     """How far the images of a completed drive are from those of good drives, in the log too.
 
     Args:
         drive: all its measurements.
         camera: that of the images.
-        contradicted: steps whose length learned depth or the speed before contradicts.
+        contradicted: steps whose length learned depth or the speed before contradicts, and how the speed leaps there.
         needs_road: whether lengths are measured on the road.
     """
     agreements: list[Agreement] = []
@@ -223,16 +223,19 @@ def of_images(
         figure = f"learned depth or the speed before contradict {len(contradicted)} of {steps}"
         if contradicted:
             figure += f", which end at frames {named([last for _, last in contradicted])}"
-        sigmas = len(contradicted) / steps / _CONTRADICTED_SPREAD
+        leap = max(map(abs, contradicted.values()), default=0.0)
+        sigmas = max(len(contradicted) / steps / _CONTRADICTED_SPREAD, leap / _LEAP_SPREAD)
+        if leap > DOUBTFUL * _LEAP_SPREAD:
+            figure += f": the speed leaps by a factor of {np.exp(leap):.1f}, so the unit holds to {50 * leap:.0f} %"
         compared("the length of steps", sigmas, figure)
-    corners_were_asked = bool(drive.steps or drive.measured.failures)
+    corners_were_asked = drive.steps or drive.measured.failures
     if corners_were_asked and (support := drive.support) is not None:
         compared("the overlap of images", *_overlap(support))
     if drive.measured.is_upside_down:
         figure = "what is high in the images is nearer than what is low: turn them by 180 degrees"
         compared("the way up of the camera", 2.0 * WRONG, figure)
     if needs_road and steps >= _LEAST:
-        sigmas = (_ON_ROAD - on_road / steps) / _ON_ROAD_SPREAD
+        sigmas = (1.0 - on_road / steps) / _ON_ROAD_SPREAD
         figure = f"{on_road} of {steps} lengths were measured on the road; the others follow from learned depth"
         compared("the view of the road", sigmas, figure)
     too_far = drive.measured.depth_error.most_too_far()

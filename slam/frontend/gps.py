@@ -99,11 +99,10 @@ class GpsFixes:
         sigma = median(self.sigmas[:, 0])
         least = _LEAST_MOTION_SIGMAS * sigma
 
-        def chords(span: int) -> tuple[FloatArray, FloatArray]:
-            by_gps, by_camera = (
-                np.linalg.norm(p[span:] - p[:-span], axis=1) for p in (self.points, estimated)
-            )
-            return by_gps, by_camera
+        def chords(span: int) -> list[FloatArray]:
+            """By GPS, and by the camera."""
+            both = (self.points, estimated)
+            return [np.linalg.norm(p[span:] - p[:-span], axis=1) for p in both]
 
         tenth = max(len(estimated) // _CHORDS, 1)
         spans = range(tenth, max(len(estimated) // 2, tenth) + 1, tenth)

@@ -19,7 +19,6 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import compress
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -97,21 +96,6 @@ class Unit:
     stated_m: float | None = None
     metres: Callable[[FloatArray], ScaleEstimate | Failed] | None = None
 
-    @property
-    def by_lidar(self) -> bool:
-        """Whether steps by LiDAR give all lengths."""
-        return self.mode == "lidar"
-
-    @property
-    def by_gps(self) -> bool:
-        """Whether a GPS track gives all lengths."""
-        return self.mode == "gps"
-
-    @property
-    def gives_metres(self) -> bool:
-        """Whether lengths are to be metres."""
-        return self.mode != "none"
-
 
 class StepLength(NamedTuple):
     """A length, its relative sigma, and the sigma of independent errors that add up as its correlated ones do."""
@@ -126,7 +110,8 @@ class Scale:
     """``per_frame`` ``(N,)`` times an unscaled length near that frame is a length in ``unit``.
 
     ``lengths`` of the steps that image geometry measured are in ``unit``. ``estimate`` is that of
-    the mode's unit, or why there is none.
+    the mode's unit, or why there is none. ``contradicted`` steps have the change of the logarithm of
+    the speed from the steps before to those after, which a unit that leaps makes.
     """
 
     mode: ScaleMode
@@ -134,7 +119,7 @@ class Scale:
     per_frame: FloatArray
     lengths: Mapping[Ends, StepLength]
     unit: LengthUnit
-    contradicted: Sequence[Ends] = ()
+    contradicted: Mapping[Ends, float]
 
     @property
     def is_metric(self) -> bool:
@@ -175,9 +160,9 @@ def find_scale(unit: Unit, drive: Drive, lidar_steps: Sequence[RelativePose] = (
         lidar_steps: steps by LiDAR, metres.
     """
     motions, frames = drive.triangulated, len(drive)
-    lidar_steps = lidar_steps if unit.by_lidar else ()
+    lidar_steps = lidar_steps if unit.mode == "lidar" else ()
     height_m = height_by_lidar(lidar_steps, drive) or unit.stated_m
-    height = 1.0 if height_m is None else height_m
+    height = height_m or 1.0
     absolute = _absolute_lengths(drive.road_steps, height, lidar_steps)
     by_planes = scale_from_road(drive.measured.roads, height)
     steps = links(motions, frames)
@@ -222,7 +207,13 @@ def find_scale(unit: Unit, drive: Drive, lidar_steps: Sequence[RelativePose] = (
     values = solved.length, solved.relative_sigma, solved.relative_correlated_sigma
     rows = zip(steps, np.transpose(values).tolist(), strict=True)
     lengths = {ends: StepLength(*row) for ends, row in rows if np.isfinite(row[0])}
-    contradicted = list(compress(steps, solved.contradicted))
+    log_speed = running_median(np.log(solved.length / evidence.seconds), _SPEED_STEPS)
+    at = np.flatnonzero(solved.contradicted)
+    # the middles of the windows that end before such a step and begin with it
+    middles = np.add.outer([-_SPEED_STEPS // 2, _SPEED_STEPS // 2], at)
+    around = log_speed[np.clip(middles, 0, len(steps) - 1)]
+    (leaps,) = np.nan_to_num(np.diff(around, axis=0)).tolist()
+    contradicted = {steps[row]: leap for row, leap in zip(at.tolist(), leaps, strict=True)}
     return Scale(unit.mode, estimate, per_frame, lengths, named, contradicted)
 
 
@@ -247,10 +238,8 @@ def height_by_lidar(lidar_steps: Sequence[RelativePose], drive: Drive) -> float 
     heights = [metres[ends] / roads[ends].length_heights for ends in roads if ends in metres]
     if not heights:
         for ends, motion in drive.triangulated.items():
-            if ends not in metres:
-                continue
             plane = drive.measured.roads[ends[0]]
-            if not isinstance(plane, Failed):
+            if ends in metres and not isinstance(plane, Failed):
                 heights.append(metres[ends] / motion.length_unscaled * plane)
     return median(heights) if heights else None
 

@@ -56,9 +56,9 @@ _TURNING = 0.5  # radians beyond which turns are told without the focal length
 _INFLATED, _FLOOR, _SYSTEMATIC = 3.0, 0.03, 0.02
 _BY_TURN = 0.3  # sigma of a window that turns by one degree; less, as it turns more
 _HUBER = 1.5
-# of a stated camera: points of a window, which takes 3 % of a run of so many keyframes (80 in 300 frames of a street),
-# and sigmas beyond which the next window is asked
-_CHECKED, _KEYFRAMES_CHECKED, _DOUBTFUL = 120, 80, 1.5
+# of a stated camera: every how many keyframes of a window, and points in these, which take 3 % of the shortest run that
+# is checked, by keyframes (90 in 300 frames of a street); sigmas beyond which a second window is asked
+_EVERY, _CHECKED, _LEAST_CHECKED, _DOUBTFUL = 2, 240, 60, 1.5
 
 
 @dataclass(frozen=True)
@@ -123,15 +123,18 @@ def find_camera(frames: Iterable[Frame]) -> FoundCamera:
 def check_camera(seen: FollowedCorners, stated: Intrinsics) -> FoundCamera:
     """The camera by the corners that a drive followed, measured from the principal point of the ``stated`` one.
 
-    A few of one window are asked, and those of the next one while it is in doubt: at most two, which are compared,
-    for each so many keyframes.
+    Every second keyframe of one window is asked, and where it is in doubt of the next one, if the drive is long enough
+    to pay for it. With fewer points of all keyframes a window ends in false minima.
     """
     told: list[Window | None] = []
     found = joined(told)
-    pairs = seen.keyframe.max(initial=0) // _KEYFRAMES_CHECKED
-    for window in windows_that_turn(seen)[: 2 * pairs]:
-        longest = np.argsort(-np.bincount(window.point), kind="stable")[:_CHECKED]
-        told.append(calibrated(window.chosen(np.isin(window.point, longest), least=2)[0], _FEW))
+    if seen.keyframe.max(initial=0) < _LEAST_CHECKED:
+        return found
+    for window in windows_that_turn(seen)[:2]:
+        part, _ = window.chosen(window.keyframe % _EVERY == 0, least=2)
+        part = replace(part, keyframe=part.keyframe // _EVERY)
+        longest = np.argsort(-np.bincount(part.point), kind="stable")[:_CHECKED]
+        told.append(calibrated(part.chosen(np.isin(part.point, longest), least=2)[0], _FEW))
         found = joined(told)
         if found.sigmas_from(stated) < _DOUBTFUL:
             break
@@ -189,8 +192,7 @@ def windows_that_turn(seen: FollowedCorners) -> list[FollowedCorners]:
     turns = [np.ptp(aside[start : start + count], axis=0).max() for start in starts if count]
     windows = []
     for n in np.argsort(turns)[::-1][:_WINDOWS].tolist():
-        rows = (seen.keyframe >= starts[n]) & (seen.keyframe < starts[n] + count)
-        part, _ = seen.chosen(rows, least=3)
+        part, _ = seen.chosen((seen.keyframe - starts[n]) // count == 0, least=3)
         windows.append(replace(part, keyframe=part.keyframe - starts[n]))
     return windows
 

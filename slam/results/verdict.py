@@ -44,10 +44,11 @@ def verdict(metrics: Metrics) -> Verdict | None:
         *_agreement(metrics),
         *_unit(metrics),
         *_noise(metrics),
+        *_rest(metrics),
+        (False, scraps),
     ]
-    said += [*_rest(metrics), *([(False, scraps)] if scraps else [])]
     signs = [words for is_sign, words in said if is_sign]
-    doubts = [words for is_sign, words in said if not is_sign]
+    doubts = [words for is_sign, words in said if words and not is_sign]
     return Verdict(_sentence(metrics), signs, doubts, scraps)
 
 

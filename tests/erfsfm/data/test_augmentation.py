@@ -35,7 +35,7 @@ def centre_of(image: NDArray[np.uint8]) -> NDArray[np.float64]:
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("flip", [0.0, 1.0])
 @pytest.mark.parametrize("zoom", [1.0, 1.15, 1.3])
-def test_points_project_to_where_the_augmented_image_has_them(seed: int, flip: float, zoom: float):
+def test_points_project_to_where_the_augmented_image_has_them(seed, flip, zoom):
     images = [blob(project(CAMERA, point)) for point in POINTS]
     config = DataConfig(flip=flip, zoom=zoom)
     varied, _, camera, _ = augment(
@@ -50,7 +50,7 @@ def test_points_project_to_where_the_augmented_image_has_them(seed: int, flip: f
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_maps_move_with_the_images(seed: int):
+def test_maps_move_with_the_images(seed):
     image = blob(project(CAMERA, POINTS[0]))
     values = image[..., 0].astype(np.float32)
     config = DataConfig(flip=0.5, zoom=1.3)
@@ -96,7 +96,7 @@ def test_the_papers_zoom_multiplies_the_camera_before_sizes_are_rounded(fidelity
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_all_frames_get_the_same_colour_change(seed: int):
+def test_all_frames_get_the_same_colour_change(seed):
     rng = np.random.default_rng(9)
     image = rng.integers(0, 256, (96, 160, 3), dtype=np.uint8)
     config = DataConfig(flip=0, zoom=1, colour_jitter=0.3)
@@ -116,13 +116,13 @@ def images() -> list[NDArray[np.uint8]]:
     return [np.repeat(np.rint(60 + 150 * spot).astype(np.uint8)[..., None], 3, axis=2)] * 5
 
 
-def test_only_the_seed_decides(images: list[NDArray[np.uint8]]):
+def test_only_the_seed_decides(images):
     first, again, other = (weathered(images, np.random.default_rng(seed)) for seed in (3, 3, 4))
     assert all(np.array_equal(a, b) for a, b in zip(first, again))
     assert any(not np.array_equal(a, b) for a, b in zip(first, other))
 
 
-def test_images_stay_images_and_many_get_worse(images: list[NDArray[np.uint8]]):
+def test_images_stay_images_and_many_get_worse(images):
     changes = []
     for seed in range(40):
         seen = weathered(images, np.random.default_rng(seed))
@@ -133,7 +133,7 @@ def test_images_stay_images_and_many_get_worse(images: list[NDArray[np.uint8]]):
     assert max(changes) < 100
 
 
-def test_positions_do_not_change(images: list[NDArray[np.uint8]]):
+def test_positions_do_not_change(images):
     """The mean over much weather has its brightest place where the clear image has it."""
     seen = [
         image.astype(float)[..., 0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -56,7 +55,7 @@ def refusal(root: Path) -> str:
 
 
 @pytest.mark.parametrize("prefix", ["", "dataset"])
-def test_kitti_root(tmp_path: Path, write_root: Callable[..., Path], prefix: str):
+def test_kitti_root(tmp_path, write_root, prefix):
     write_root(tmp_path / prefix, sequences=("00", "09"), frames=4)
     recordings = discover(tmp_path)
     assert [r.name for r in recordings] == ["kitti_odometry/00", "kitti_odometry/09"]
@@ -73,7 +72,7 @@ def test_kitti_root(tmp_path: Path, write_root: Callable[..., Path], prefix: str
     assert isinstance(camera.fx, float)
 
 
-def test_simulated_root_is_named_by_its_seed(tmp_path: Path, write_root: Callable[..., Path]):
+def test_simulated_root_is_named_by_its_seed(tmp_path, write_root):
     write_root(tmp_path, frames=3, seed=17, depth=True)
     recording = one(tmp_path)
     assert recording.name == "simulated/17"
@@ -83,7 +82,7 @@ def test_simulated_root_is_named_by_its_seed(tmp_path: Path, write_root: Callabl
     assert float(depth[0, 0]) == pytest.approx(5.9, abs=1 / 256)
 
 
-def test_rooms_are_exact_in_a_unit_of_their_own(tmp_path: Path):
+def test_rooms_are_exact_in_a_unit_of_their_own(tmp_path):
     rooms = SimulatedRooms(SimulationOptions("rooms", 2, 0, 64, 48))
     write_kitti_root(rooms, tmp_path / "rooms", depth=True)
     (recording,) = discover(tmp_path / "rooms")
@@ -91,7 +90,7 @@ def test_rooms_are_exact_in_a_unit_of_their_own(tmp_path: Path):
     assert recording.camera_height_m == INDOOR_HEIGHT_M
 
 
-def test_poses_and_parts(tmp_path: Path, write_root: Callable[..., Path]):
+def test_poses_and_parts(tmp_path, write_root):
     write_root(tmp_path, frames=6, depth=True, step=(0.0, 0.0, 0.5))
     whole = one(tmp_path)
     part = whole.part(2, 5)
@@ -105,9 +104,7 @@ def test_poses_and_parts(tmp_path: Path, write_root: Callable[..., Path]):
     assert len(whole.part(4, 10**9)) == 2
 
 
-def test_poses_are_those_of_the_camera_that_took_the_images(
-    tmp_path: Path, write_root: Callable[..., Path]
-):
+def test_poses_are_those_of_the_camera_that_took_the_images(tmp_path, write_root):
     """P2 with 60 px * 0.5 m in its last column: camera 2 is half a metre left of camera 0, which rotates left."""
     write_root(tmp_path, frames=2)
     (tmp_path / "sequences/00/calib.txt").write_text("P2: 60 0 47.5 30 0 62 31.5 0 0 0 1 0\n")
@@ -120,7 +117,7 @@ def test_poses_are_those_of_the_camera_that_took_the_images(
 
 
 @pytest.mark.parametrize("inside", ["", "images"])
-def test_image_folder(tmp_path: Path, inside: str):
+def test_image_folder(tmp_path, inside):
     root = write_camera(tmp_path / "my_drive")
     write_images(root / inside)
     recording = one(root)
@@ -131,7 +128,7 @@ def test_image_folder(tmp_path: Path, inside: str):
     assert recording.image(1, 16, 24).shape == (16, 24, 3)
 
 
-def test_a_camera_that_is_given_comes_before_the_one_beside_the_images(tmp_path: Path):
+def test_a_camera_that_is_given_comes_before_the_one_beside_the_images(tmp_path):
     """Of several drives under one root, without a camera of their own, too."""
     file = write_camera(tmp_path / "calibration", fx=50.0, fy=50.0) / "camera.yaml"
     write_images(write_camera(tmp_path / "root/first"))
@@ -151,7 +148,7 @@ def write_video(path: Path, frames: int = 4) -> None:
 
 
 @pytest.mark.parametrize("give", ["drive.avi", ""])
-def test_video(tmp_path: Path, give: str):
+def test_video(tmp_path, give):
     root = write_camera(tmp_path / "trip")
     write_video(root / "drive.avi")
     recording = one(root / give)
@@ -166,7 +163,7 @@ def test_video(tmp_path: Path, give: str):
 
 
 @pytest.mark.parametrize("content", [[], ["readme.txt"], ["sequences/"], ["sequences/00/"]])
-def test_a_root_without_recordings(tmp_path: Path, content: list[str]):
+def test_a_root_without_recordings(tmp_path, content):
     for name in content:
         if name.endswith("/"):
             (tmp_path / name).mkdir(parents=True)
@@ -175,15 +172,13 @@ def test_a_root_without_recordings(tmp_path: Path, content: list[str]):
     assert "no recording" in refusal(tmp_path)
 
 
-def test_poses_that_are_no_rotations(tmp_path: Path, write_root: Callable[..., Path]):
+def test_poses_that_are_no_rotations(tmp_path, write_root):
     write_root(tmp_path, frames=1)
     (tmp_path / "poses/00.txt").write_text("0 0 0 0 0 0 0 0 0 0 0 0\n")
     assert "no rotation" in refusal(tmp_path)
 
 
-def test_a_recording_is_split_at_its_gaps(
-    tmp_path: Path, write_root: Callable[..., Path], caplog: pytest.LogCaptureFixture
-):
+def test_a_recording_is_split_at_its_gaps(tmp_path, write_root, caplog):
     write_root(tmp_path, frames=9, depth=True, step=(0.0, 0.0, 0.5))
     for number in (0, 3, 4):
         (tmp_path / f"sequences/00/image_2/{number:06d}.png").unlink()
@@ -207,7 +202,7 @@ NAME = "kitti_raw/2011_09_26_drive_0001"
 
 
 @pytest.mark.parametrize("place", ["", "2011_09_26", "2011_09_26/2011_09_26_drive_0001_sync"])
-def test_root_may_be_a_date_or_a_drive(tmp_path: Path, write_raw: Callable[..., Path], place: str):
+def test_root_may_be_a_date_or_a_drive(tmp_path, write_raw, place):
     write_raw(tmp_path / "raw")
     left, right = discover(tmp_path / "raw" / place)
     assert left.frames_name == right.frames_name == f"{NAME}[0:6]"
@@ -217,7 +212,7 @@ def test_root_may_be_a_date_or_a_drive(tmp_path: Path, write_raw: Callable[..., 
     ]
 
 
-def test_every_drive_of_every_date(tmp_path: Path, write_raw: Callable[..., Path]):
+def test_every_drive_of_every_date(tmp_path, write_raw):
     for drive in ("2011_10_03_drive_0047", "2011_09_26_drive_0005", "2011_09_26_drive_0002"):
         write_raw(tmp_path, drive=drive, frames=1)
     (tmp_path / "2011_09_26/2011_09_26_drive_0009_sync/oxts").mkdir(
@@ -231,7 +226,7 @@ def test_every_drive_of_every_date(tmp_path: Path, write_raw: Callable[..., Path
     ]
 
 
-def test_intrinsics_follow_the_stored_size(tmp_path: Path, write_raw: Callable[..., Path]):
+def test_intrinsics_follow_the_stored_size(tmp_path, write_raw):
     full, _ = open_drive(write_raw(tmp_path / "full"))
     half, _ = open_drive(write_raw(tmp_path / "half", stored=(32, 48)))
     assert (full.camera.width, full.camera.fx, full.camera.cx) == (96, 60, 47)
@@ -241,7 +236,7 @@ def test_intrinsics_follow_the_stored_size(tmp_path: Path, write_raw: Callable[.
     assert right.camera.cx == 46, "each camera has its own row"
 
 
-def test_grey_cameras_where_there_is_no_colour(tmp_path: Path, write_raw: Callable[..., Path]):
+def test_grey_cameras_where_there_is_no_colour(tmp_path, write_raw):
     drive = write_raw(tmp_path)
     shutil.copytree(drive / "image_02", drive / "image_00")
     for camera in ("image_02", "image_03"):
@@ -250,7 +245,7 @@ def test_grey_cameras_where_there_is_no_colour(tmp_path: Path, write_raw: Callab
     assert recording.images[0].parts[-3] == "image_00"
 
 
-def test_parts_keep_the_numbers_of_the_drive(tmp_path: Path, write_raw: Callable[..., Path]):
+def test_parts_keep_the_numbers_of_the_drive(tmp_path, write_raw):
     drive = write_raw(tmp_path, speeds=[9.0] * 6)
     for camera in ("image_02", "image_03"):
         for number in (0, 3):
@@ -259,7 +254,7 @@ def test_parts_keep_the_numbers_of_the_drive(tmp_path: Path, write_raw: Callable
 
 
 @pytest.mark.data
-def test_a_real_drive(data_root: Path):
+def test_a_real_drive(data_root):
     (recording,) = discover(data_root / "kitti_raw")
     assert recording.frames_name == "kitti_raw/2011_09_26_drive_0013[0:144]"
     camera = recording.camera

@@ -15,7 +15,7 @@ def measured(sigma: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("sigma", [0.01, 0.037, 0.13, 0.5])
-def test_values_move_by_less_than_their_sigma(sigma: float):
+def test_values_move_by_less_than_their_sigma(sigma):
     least, most = measured(sigma)
     got_least, got_most = (bound.astype(np.float32) for bound in decode(encode(least, most)))
     moved = np.log(got_least * got_most / (least * most)) / 2

@@ -68,7 +68,7 @@ def draws(config: ExperimentConfig, folder: Path) -> SnippetDraws:
     )
 
 
-def test_it_has_the_same_samples(config: ExperimentConfig, tmp_path: Path):
+def test_it_has_the_same_samples(config, tmp_path):
     prepare(config, tmp_path / "prepared")
     elsewhere = changed(config, roots=[tmp_path / "prepared"])
     original, again = draws(config, tmp_path / "measured"), draws(elsewhere, tmp_path / "nowhere")
@@ -84,7 +84,7 @@ def test_it_has_the_same_samples(config: ExperimentConfig, tmp_path: Path):
     assert load_model(tmp_path / "run").record.trained_on == ["kitti_odometry/00[2:11]"]
 
 
-def test_a_part_of_it_has_its_own_labels(config: ExperimentConfig, tmp_path: Path):
+def test_a_part_of_it_has_its_own_labels(config, tmp_path):
     prepare(config, tmp_path / "prepared")
     part = changed(config, roots=[tmp_path / "prepared"], ranges={"kitti_odometry/00": "4:11"})
     drive = draws(part, tmp_path / "nowhere")
@@ -96,9 +96,7 @@ def test_a_part_of_it_has_its_own_labels(config: ExperimentConfig, tmp_path: Pat
     assert {recording.start + t for t in teacher.drive(recording).targets(sources=2)} == {5, 8}
 
 
-def test_validation_is_on_the_same_snippets_with_their_truth(
-    config: ExperimentConfig, tmp_path: Path
-):
+def test_validation_is_on_the_same_snippets_with_their_truth(config, tmp_path):
     prepare(config, tmp_path / "prepared")
     _, held_out = split_recordings(config.data)
     _, copied = split_recordings(changed(config, roots=[tmp_path / "prepared"]).data)
@@ -110,13 +108,7 @@ def test_validation_is_on_the_same_snippets_with_their_truth(
         assert torch.equal(other["depth"], one["depth"])
 
 
-def test_images_that_cannot_be_read_are_left_out(
-    config: ExperimentConfig,
-    roots: list[Path],
-    small: Small,
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-):
+def test_images_that_cannot_be_read_are_left_out(config, roots, small, tmp_path, caplog):
     (roots[0] / "sequences/00/image_2/000005.png").write_bytes(b"no image")
     tree = small | {"data": small["data"] | {"roots": roots[:1], "exclude": []}}
     config = ExperimentConfig.model_validate(tree)
@@ -125,7 +117,7 @@ def test_images_that_cannot_be_read_are_left_out(
     train(changed(config, roots=[tmp_path / "prepared"]), tmp_path / "run", device="cpu")
 
 
-def test_what_is_there_is_never_overwritten(config: ExperimentConfig, tmp_path: Path):
+def test_what_is_there_is_never_overwritten(config, tmp_path):
     (tmp_path / "prepared").mkdir()
     (tmp_path / "prepared" / "thesis.txt").touch()
     with pytest.raises(ConfigError, match="not empty"):
@@ -133,7 +125,7 @@ def test_what_is_there_is_never_overwritten(config: ExperimentConfig, tmp_path: 
     assert [path.name for path in (tmp_path / "prepared").iterdir()] == ["thesis.txt"]
 
 
-def test_one_that_fails_leaves_nothing(config: ExperimentConfig, roots: list[Path], tmp_path: Path):
+def test_one_that_fails_leaves_nothing(config, roots, tmp_path):
     before = sorted(tmp_path.iterdir())
     for image in sorted(roots[1].rglob("depth_2/*.png")):
         image.write_bytes(b"no depth")
@@ -142,14 +134,14 @@ def test_one_that_fails_leaves_nothing(config: ExperimentConfig, roots: list[Pat
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_labels_of_another_teacher_are_asked_for(config: ExperimentConfig, tmp_path: Path):
+def test_labels_of_another_teacher_are_asked_for(config, tmp_path):
     prepare(config, tmp_path / "prepared")
     finer = config.model_copy(update={"teacher": config.teacher.model_copy(update={"stride": 1})})
     with pytest.raises(TrainingError, match="prepare the data again"):
         train(changed(finer, roots=[tmp_path / "prepared"]), tmp_path / "run", device="cpu")
 
 
-def test_stops_stay_out(small: Small, write_raw: Callable[..., Path], tmp_path: Path):
+def test_stops_stay_out(small, write_raw, tmp_path):
     drive = write_raw(
         tmp_path / "raw", drive="2011_10_03_drive_0099", speeds=[5] * 6 + [0] * 3 + [5] * 6
     )
@@ -166,7 +158,7 @@ def test_stops_stay_out(small: Small, write_raw: Callable[..., Path], tmp_path: 
     ]
 
 
-def test_the_command_says_how_to_go_on(write_root: Callable[..., Path], tmp_path: Path):
+def test_the_command_says_how_to_go_on(write_root, tmp_path):
     world = write_root(tmp_path / "world", frames=8, seed=3)
     size = ["--set", "network.height=32", "--set", "network.width=64", "--set", "training.steps=2"]
     command = [

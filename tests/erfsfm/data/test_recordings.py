@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from erfsfm.common.errors import TrainingError
 from erfsfm.common.readers.images import read_image
 from erfsfm.common.readers.video import VideoFrames
 from erfsfm.data import many_view_teacher
@@ -40,14 +41,14 @@ def number(image: np.ndarray) -> int:
 @pytest.mark.parametrize(
     ("suffix", "codec"), [(".mp4", "mp4v"), (".avi", "MJPG"), (".mkv", "mp4v")]
 )
-def test_frames_in_any_order(tmp_path: Path, suffix: str, codec: str):
+def test_frames_in_any_order(tmp_path, suffix, codec):
     video = Video(write(tmp_path / f"a{suffix}", codec=codec))
     assert (len(video), video.width, video.height) == (FRAMES, *SIZE)
     order = [0, 39, 7, 8, 30, 2, 39, 7]
     assert [number(video.image(index, 32, 48)) for index in order] == order
 
 
-def test_the_file_is_decoded_once_a_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_file_is_decoded_once_a_size(tmp_path, monkeypatch):
     video = Video(write(tmp_path / "a.mp4"))
     opened: list[Path] = []
 
@@ -67,9 +68,7 @@ def test_the_file_is_decoded_once_a_size(tmp_path: Path, monkeypatch: pytest.Mon
     assert len(opened) == 2
 
 
-def test_the_teacher_gets_the_frames_of_a_part_as_images(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_the_teacher_gets_the_frames_of_a_part_as_images(tmp_path, monkeypatch):
     video = Video(write(tmp_path / "a.mp4"))
     whole = Recording(
         "folder/a", (video.path,) * len(video), Camera(48, 32, 40.0, 40.0, 23.5, 15.5), video
@@ -86,16 +85,19 @@ def test_the_teacher_gets_the_frames_of_a_part_as_images(
             output / "trajectory_optimised.kitti.txt",
             np.tile(np.eye(4)[:3].ravel(), (len(numbers), 1)),
         )
-        (output / "metrics.json").write_text(json.dumps({"scale": {"mode": "camera-height"}}))
+        unit = "metres" if len(numbers) == 4 else "the networks' own unit"
+        (output / "metrics.json").write_text(json.dumps({"scale": {"unit": unit}}))
         return ""
 
     monkeypatch.setattr(many_view_teacher, "slam_process", slam)
     teacher = ManyViewTeacher(tmp_path / "measured", (16, 24), stride=2, with_depth=False)
     teacher.prepare([whole.part(20, 24)], 2, "sim", lambda *_: None)
     assert numbers == [20, 21, 22, 23]
+    with pytest.raises(TrainingError, match="no road was found"):
+        teacher.prepare([whole.part(30, 33)], 2, "sim", lambda *_: None)
 
 
-def test_a_video_that_was_cut_off(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_a_video_that_was_cut_off(tmp_path, caplog):
     """An avi keeps its count of frames in front: half the file has half of them, and a warning is logged."""
     path = write(tmp_path / "a.avi", codec="MJPG")
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,6 +19,7 @@ from torch.utils.data import DataLoader
 
 from erfsfm.common.errors import DataError
 from erfsfm.config import ExperimentConfig, TeacherConfig
+from erfsfm.data import many_view_teacher
 from erfsfm.data.augmentation import FOCAL_LENGTH
 from erfsfm.data.discovery import INDOOR_HEIGHT_M, discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
@@ -62,7 +64,7 @@ def coded(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("fidelity", "cx"), [("default", 24 * 2 / 3 - 0.5), ("paper", 23.5 * 2 / 3)]
 )
-def test_samples_have_the_intrinsics_of_their_fidelity(coded: Path, fidelity: str, cx: float):
+def test_samples_have_the_intrinsics_of_their_fidelity(coded, fidelity, cx):
     """Images of 48 pixels at a width of 32."""
     config = experiment(flip=0, zoom=1)
     network = config.network.model_copy(update={"width": 32, "fidelity": fidelity})
@@ -75,9 +77,7 @@ def test_samples_have_the_intrinsics_of_their_fidelity(coded: Path, fidelity: st
         assert float(sample["K"][0, 2]) == pytest.approx(cx)
 
 
-def test_snippets_with_a_broken_image_are_passed_over_and_others_stay(
-    coded: Path, caplog: pytest.LogCaptureFixture
-):
+def test_snippets_with_a_broken_image_are_passed_over_and_others_stay(coded, caplog):
     def drawn() -> list[dict[str, Tensor]]:
         recordings = discover(coded / "a") + discover(coded / "b")
         draws = SnippetDraws(recordings, experiment(flip=0), 40)
@@ -113,7 +113,7 @@ def equal(first: dict[str, Tensor], second: dict[str, Tensor]) -> bool:
 
 
 @pytest.mark.parametrize("sources", [2, 4])
-def test_windows_are_consecutive_frames_with_the_target_in_the_middle(coded: Path, sources: int):
+def test_windows_are_consecutive_frames_with_the_target_in_the_middle(coded, sources):
     draws = SnippetDraws(discover(coded), experiment(sources=sources), 200)
     starts = set()
     for number in range(200):
@@ -136,7 +136,7 @@ def batches(coded: Path, workers: int, first: int = 0, draws: int = 10) -> list[
     )
 
 
-def test_weather_changes_only_the_network_input(coded: Path):
+def test_weather_changes_only_the_network_input(coded):
     clear = SnippetDraws(discover(coded), experiment(), 20)
     wet = SnippetDraws(discover(coded), experiment(weather=0.5), 20)
     changed = 0
@@ -152,7 +152,7 @@ def test_weather_changes_only_the_network_input(coded: Path):
     assert 3 <= changed <= 16
 
 
-def test_what_a_mask_hides_comes_with_every_sample(coded: Path):
+def test_what_a_mask_hides_comes_with_every_sample(coded):
     mask = np.full((32, 48), 255, np.uint8)
     mask[24:] = 0
     cv2.imwrite(str(coded / "a" / "mask.png"), mask)
@@ -168,12 +168,27 @@ def test_what_a_mask_hides_comes_with_every_sample(coded: Path):
         assert not sample["fixed"][0, :23].any()
 
 
-def test_a_camera_that_has_to_be_found_is_found_by_a_run(coded: Path):
-    with pytest.raises(DataError, match="erfsfm-slam run"):
-        split_recordings(experiment(roots=[str(coded)]).data, Path("auto"))
+def test_a_camera_that_has_to_be_found_is_found_by_one_run(coded, monkeypatch, caplog):
+    asked = []
+
+    def slam(words: list[str]) -> str:
+        asked.append(words[0])
+        scene = Path(words[words.index("--output") + 1])
+        shutil.copytree(coded / "a", scene, dirs_exist_ok=True)
+        (scene / "camera.yaml").write_text(f"{CAMERA}source: it is 40 px")
+        return "no road" if "auto,height=2" in words else ""
+
+    monkeypatch.setattr(many_view_teacher, "slam_process", slam)
+    config = experiment(roots=[str(coded / "b")], validation=[]).data
+    for _ in range(2):
+        (found,), _ = split_recordings(config, Path("auto"), coded / "teacher")
+    assert asked == ["run", "export"] and caplog.messages == [f"{coded / 'b'}: it is 40 px"]
+    assert found.name == "folder/b" and found.images[0].is_relative_to(coded / "teacher")
+    with pytest.raises(DataError, match=r"camera of .*b could not be found: no road"):
+        split_recordings(config, Path("auto,height=2"), coded / "teacher")
 
 
-def test_resuming_draws_the_same_samples(coded: Path):
+def test_resuming_draws_the_same_samples(coded):
     whole = batches(coded, 0)
     for workers in (0, 2):
         tail = batches(coded, workers, first=6)
@@ -182,7 +197,7 @@ def test_resuming_draws_the_same_samples(coded: Path):
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_devices_share_the_draws_of_one_with_a_larger_batch(coded: Path, workers: int):
+def test_devices_share_the_draws_of_one_with_a_larger_batch(coded, workers):
     whole = list(DataLoader(SnippetDraws(discover(coded), experiment(batch=4), 16, 4), 4))
     config = experiment(batch=2, devices=2)
     parts = [
@@ -194,7 +209,7 @@ def test_devices_share_the_draws_of_one_with_a_larger_batch(coded: Path, workers
         assert equal(batch, {key: torch.cat([part[key] for part in batches]) for key in batch})
 
 
-def test_weights_set_the_probabilities(coded: Path):
+def test_weights_set_the_probabilities(coded):
     long, short = discover(coded)
     config = experiment(weights={"folder/a": 1, "folder/b": 3})
     draws = SnippetDraws([long, short.part(0, 4)], config, 400)
@@ -205,7 +220,7 @@ def test_weights_set_the_probabilities(coded: Path):
 # validation
 
 
-def test_validation_is_even_and_always_the_same(coded: Path, monkeypatch: pytest.MonkeyPatch):
+def test_validation_is_even_and_always_the_same(coded, monkeypatch):
     monkeypatch.setattr("erfsfm.data.snippets._VALIDATED", 3)
     config = experiment()
     snippets = ValidationSnippets(discover(coded)[:1], config)
@@ -218,7 +233,7 @@ def test_validation_is_even_and_always_the_same(coded: Path, monkeypatch: pytest
     assert set(snippets[0]) == {"target", "sources", "K"}
 
 
-def test_validation_truth(tmp_path: Path, write_root: Callable[..., Path]):
+def test_validation_truth(tmp_path, write_root):
     write_root(tmp_path, frames=5, depth=True, step=(0.05, 0.0, 0.1))
     (recording,) = discover(tmp_path)
     sample = ValidationSnippets([recording.part(0, 5)], experiment(sources=4))[0]
@@ -231,7 +246,7 @@ def test_validation_truth(tmp_path: Path, write_root: Callable[..., Path]):
     torch.testing.assert_close(T_source_target[:, 2, 3], 0.1 * steps)
 
 
-def test_exact_labels_of_a_snippet_and_its_mirror_image(tmp_path: Path):
+def test_exact_labels_of_a_snippet_and_its_mirror_image(tmp_path):
     """True motion and depth in camera heights, of a camera of the reference focal length."""
     street = SimulatedStreet(SimulationOptions("straight", 6, 1, 96, 64))
     write_kitti_root(street, tmp_path, depth=True)
@@ -269,9 +284,7 @@ def test_exact_labels_of_a_snippet_and_its_mirror_image(tmp_path: Path):
     )
 
 
-def test_exact_labels_are_wanted_of_every_recording(
-    tmp_path: Path, write_root: Callable[..., Path]
-):
+def test_exact_labels_are_wanted_of_every_recording(tmp_path, write_root):
     config = experiment(sources=2).model_copy(update={"teacher": TeacherConfig(structure_weight=1)})
     with pytest.raises(DataError, match=r"kitti_odometry/00 has none: simulate with --depth"):
         SnippetDraws(discover(write_root(tmp_path, 6)), config, draws=4)
@@ -330,9 +343,7 @@ def mixed(
     return build
 
 
-def test_the_label_is_the_inverse_depth_in_camera_heights(
-    world: Path, mixed: Callable[..., ExperimentConfig], measure: Callable[..., None]
-):
+def test_the_label_is_the_inverse_depth_in_camera_heights(world, mixed, measure):
     config = mixed()
     measure(config, lambda *_: 0.25)
     recordings, _ = split_recordings(config.data)
@@ -357,9 +368,7 @@ def test_the_label_is_the_inverse_depth_in_camera_heights(
     torch.testing.assert_close(sample["least"][0], torch.where(known, wanted, 0))
 
 
-def test_a_batch_begins_with_its_share_of_single_images(
-    mixed: Callable[..., ExperimentConfig], measure: Callable[..., None]
-):
+def test_a_batch_begins_with_its_share_of_single_images(mixed, measure):
     config = mixed()
     measure(config, lambda *_: 0.25)
     recordings, _ = split_recordings(config.data)
@@ -372,9 +381,7 @@ def test_a_batch_begins_with_its_share_of_single_images(
     assert singles == [True, True, False, False] * 2
 
 
-def test_a_prepared_folder_trains_without_the_worlds(
-    mixed: Callable[..., ExperimentConfig], measure: Callable[..., None], tmp_path: Path
-):
+def test_a_prepared_folder_trains_without_the_worlds(mixed, measure, tmp_path):
     config = mixed()
     measure(config, lambda *_: 0.25)
     prepare(config, tmp_path / "prepared")
@@ -396,10 +403,7 @@ def test_a_prepared_folder_trains_without_the_worlds(
 
 @pytest.mark.parametrize("where", [".", "images"])
 def test_a_depth_camera_is_exact_and_what_it_does_not_see_may_be_anywhere(
-    mixed: Callable[..., ExperimentConfig],
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-    where: str,
+    mixed, tmp_path, caplog, where
 ):
     folder = tmp_path / "office"
     (folder / "depth").mkdir(parents=True)
@@ -432,7 +436,7 @@ def test_a_depth_camera_is_exact_and_what_it_does_not_see_may_be_anywhere(
     assert "000003.png" in caplog.text
 
 
-def test_worlds_are_drawn_by_their_weight(world: Path, mixed: Callable[..., ExperimentConfig]):
+def test_worlds_are_drawn_by_their_weight(world, mixed):
     (recording,) = discover(world)
     twice = [recording, replace(recording, name="folder/office")]
     np.testing.assert_allclose(chances(twice, [1, 1], {"simulated": 9, "folder": 1}), [0.9, 0.1])
@@ -455,9 +459,7 @@ def imitation(root: Path) -> ExperimentConfig:
     return ExperimentConfig.model_validate(tree)
 
 
-def test_the_label_is_what_the_network_gives_for_the_larger_image(
-    write_root: Callable[..., Path], tmp_path: Path
-):
+def test_the_label_is_what_the_network_gives_for_the_larger_image(write_root, tmp_path):
     config = imitation(write_root(tmp_path / "real", 3))
     (recording,), _ = split_recordings(config.data)
     seen = []
@@ -478,7 +480,7 @@ def test_the_label_is_what_the_network_gives_for_the_larger_image(
     assert len(seen) == 1, "the label is kept"
 
 
-def test_it_trains_depth_alone(write_root: Callable[..., Path], tmp_path: Path):
+def test_it_trains_depth_alone(write_root, tmp_path):
     output = train(imitation(write_root(tmp_path / "real", 5)), tmp_path / "run", device="cpu")
     assert (output / "last" / "depth.safetensors").is_file()
     assert not (output / "last" / "pose.safetensors").exists()

@@ -23,18 +23,18 @@ def kitti(tmp_path: Path, write_root: Callable[..., Path]) -> Path:
     return write_root(tmp_path / "kitti", frames=6, sequences=("00", "03", "09", "10"), size=(8, 8))
 
 
-def test_test_sequences_are_never_trained_on(kitti: Path):
+def test_test_sequences_are_never_trained_on(kitti):
     assert names(DataConfig(roots=[kitti])) == (["kitti_odometry/00[0:6]"], [])
 
 
-def test_a_misspelt_kind_is_not_left_in_the_training(kitti: Path):
+def test_a_misspelt_kind_is_not_left_in_the_training(kitti):
     with pytest.raises(DataError, match=r"data\.exclude names 'simulatd/3'"):
         split_recordings(DataConfig(roots=[kitti], exclude=["simulatd/3"]))
     with pytest.raises(DataError, match=r"--camera own\.yaml is for images and videos of your own"):
         split_recordings(DataConfig(roots=[kitti]), Path("own.yaml"))
 
 
-def test_ranges_and_parts_that_are_excluded(kitti: Path):
+def test_ranges_and_parts_that_are_excluded(kitti):
     """The frames around such a part train."""
     training, _ = names(DataConfig(roots=[kitti], ranges={"kitti_odometry/00": "1:4"}, exclude=[]))
     assert training[0] == "kitti_odometry/00[1:4]" and len(training) == 4
@@ -50,7 +50,7 @@ def test_ranges_and_parts_that_are_excluded(kitti: Path):
     assert names(config)[0] == ["kitti_odometry/00[0:2]"]
 
 
-def test_validation_recordings_only_validate(tmp_path: Path, write_root: Callable[..., Path]):
+def test_validation_recordings_only_validate(tmp_path, write_root):
     for seed in (499, 500, 599):
         write_root(tmp_path / str(seed), frames=2, seed=seed, size=(8, 8))
     training, validation = names(DataConfig(roots=[tmp_path]))
@@ -77,7 +77,7 @@ def drives(config: DataConfig) -> tuple[set[str], set[str]]:
     return {r.name[-10:] for r in training}, {r.name[-10:] for r in validation}
 
 
-def test_eigens_scenes_and_test_sequences_are_left_out(raw: Path):
+def test_eigens_scenes_and_test_sequences_are_left_out(raw):
     assert drives(DataConfig(roots=[raw])) == ({"drive_0001", "drive_0005"}, set())
     everything = DataConfig(roots=[raw], exclude=[])
     assert drives(everything)[0] == {
@@ -90,7 +90,7 @@ def test_eigens_scenes_and_test_sequences_are_left_out(raw: Path):
     assert "drive_0033" not in drives(DataConfig(roots=[raw], exclude=["kitti_odometry/09"]))[0]
 
 
-def test_static_frames_are_left_out(raw: Path, caplog: pytest.LogCaptureFixture):
+def test_static_frames_are_left_out(raw, caplog):
     with caplog.at_level("INFO"):
         training, _ = names(
             DataConfig(roots=[raw], exclude=["kitti_raw/2011_09_26_drive_0005", "eigen"])
@@ -102,7 +102,7 @@ def test_static_frames_are_left_out(raw: Path, caplog: pytest.LogCaptureFixture)
     assert "4 of 24 frames" in caplog.text
 
 
-def test_the_odometry_split(tmp_path: Path, write_root: Callable[..., Path]):
+def test_the_odometry_split(tmp_path, write_root):
     root = write_root(
         tmp_path, frames=3, sequences=("00", "03", "06", "09", "10", "11"), size=(8, 8)
     )
@@ -113,9 +113,7 @@ def test_the_odometry_split(tmp_path: Path, write_root: Callable[..., Path]):
     assert validation == ["kitti_odometry/06[0:3]"]
 
 
-def test_the_end_of_each_recording_that_is_long_enough_is_kept_to_validate_on(
-    tmp_path: Path, write_root: Callable[..., Path]
-):
+def test_the_end_of_each_recording_that_is_long_enough_is_kept_to_validate_on(tmp_path, write_root):
     write_root(tmp_path / "long", 50, ("01",), size=(32, 48))
     write_root(tmp_path / "short", 20, ("04",), size=(32, 48))
     config = DataConfig(
@@ -134,7 +132,7 @@ def test_the_end_of_each_recording_that_is_long_enough_is_kept_to_validate_on(
 
 
 @pytest.mark.parametrize(("name", "count"), [("eigen", 61), ("odometry", 11)])
-def test_nothing_is_in_two_lists(name: str, count: int):
+def test_nothing_is_in_two_lists(name, count):
     split = read_split_file(name)
     assert split.train and split.validation
     assert overlapping([*split.train, *split.validation], split.test_recordings) == []
@@ -152,7 +150,7 @@ def test_nothing_is_in_two_lists(name: str, count: int):
         ("0:7:3, 9,11:13", [0, 3, 6, 9, 11, 12]),
     ],
 )
-def test_runs(runs: str, frames: list[int]):
+def test_runs(runs, frames):
     assert Split(test=[f"kitti_raw/a[{runs}]"]).test_frames() == [
         ("kitti_raw/a", frame) for frame in frames
     ]

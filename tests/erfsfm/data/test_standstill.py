@@ -33,14 +33,12 @@ def spans(recording: Recording) -> list[tuple[int, int]]:
         ([0, 0.6, 0, 0, 0, 5], [(1, 2), (5, 6)]),
     ],
 )
-def test_by_speed(
-    tmp_path: Path, write_raw: WriteDrive, speeds: list[float], expected: list[tuple[int, int]]
-):
+def test_by_speed(tmp_path, write_raw, speeds, expected):
     for recording in open_drive(write_raw(tmp_path, speeds=speeds)):
         assert spans(recording) == expected
 
 
-def test_parts_of_parts_keep_their_numbers(tmp_path: Path, write_raw: WriteDrive):
+def test_parts_of_parts_keep_their_numbers(tmp_path, write_raw):
     left, _ = open_drive(write_raw(tmp_path, speeds=[9, 9, 9, 0, 9, 9, 9]))
     names = [part.frames_name for part in moving_parts(left.part(1, 6))]
     assert names == [f"{left.name}[1:3]", f"{left.name}[4:6]"]
@@ -64,9 +62,7 @@ def street(shift: int, traffic: int, gain: float, rng: np.random.Generator) -> n
         (5, [(0, 4), (5, 6), (7, 10)]),
     ],
 )
-def test_by_images_where_there_is_no_speed(
-    tmp_path: Path, write_raw: WriteDrive, broken: int | None, kept: list[tuple[int, int]]
-):
+def test_by_images_where_there_is_no_speed(tmp_path, write_raw, broken, kept):
     """Traffic, noise and exposure change while the car stands from frame 3 to 6: its images stay those of frame 3.
 
     An image that cannot be read is passed over: the next one is compared with the one before it.
@@ -83,7 +79,7 @@ def test_by_images_where_there_is_no_speed(
     assert recording.oxts is None and spans(recording) == kept
 
 
-def test_by_images_at_night(tmp_path: Path, write_raw: WriteDrive):
+def test_by_images_at_night(tmp_path, write_raw):
     """A car that drives at night, under a plain sky, and stands from frame 3 to 6."""
     drive = write_raw(tmp_path, speeds=None, frames=10, size=(64, 208))
     rng = np.random.default_rng(1)
@@ -95,7 +91,7 @@ def test_by_images_at_night(tmp_path: Path, write_raw: WriteDrive):
 
 
 @pytest.mark.data
-def test_real_recordings_never_stand_still(data_root: Path):
+def test_real_recordings_never_stand_still(data_root):
     """A drive at 38 km/h and more: by speed and by images."""
     (drive,) = (data_root / "kitti_raw/2011_09_26").glob("*_0013_sync")
     (recording,) = open_drive(drive)
@@ -104,9 +100,7 @@ def test_real_recordings_never_stand_still(data_root: Path):
     assert spans(blind) == [(0, 40)]
 
 
-def test_of_a_camera_that_moves_little_every_nth_frame_is_taken(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-):
+def test_of_a_camera_that_moves_little_every_nth_frame_is_taken(tmp_path, caplog):
     picture = street(0, 0, 0, np.random.default_rng(2))
     for index in range(120):
         shift = np.array([[1.0, 0.0, 0.03 * index], [0.0, 1.0, 0.0]])
@@ -117,9 +111,7 @@ def test_of_a_camera_that_moves_little_every_nth_frame_is_taken(
 
 
 @pytest.mark.parametrize(("standing", "expected"), [(3, [(0, 60)]), (14, [(0, 20), (34, 60)])])
-def test_a_doubled_frame_of_an_own_recording_is_no_stop(
-    tmp_path: Path, standing: int, expected: list[tuple[int, int]]
-):
+def test_a_doubled_frame_of_an_own_recording_is_no_stop(tmp_path, standing, expected):
     folder = tmp_path / "drive"
     (folder / "images").mkdir(parents=True)
     rng = np.random.default_rng(2)

@@ -25,7 +25,7 @@ class Painted:
 
 
 @pytest.mark.parametrize("limit_mb, decoded", [(10, [0, 1]), (0, [0, 1, 0, 1])])
-def test_decodes_once_while_there_is_room(limit_mb: int, decoded: list[int]):
+def test_decodes_once_while_there_is_room(limit_mb, decoded):
     recording, cache = Painted(), ArrayCache(limit_mb, (HEIGHT, WIDTH, 3), np.uint8)
     for index in (0, 1, 0, 1):
         (image,) = load_window(cache, Snippet(recording, index), 1)  # type: ignore[arg-type]

@@ -6,7 +6,6 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,9 +40,7 @@ def test_the_loss_is_least_at_the_truth_and_where_the_sigma_is_the_error():
 
 
 @pytest.mark.slow
-def test_a_network_is_trained_on_worlds_and_refines_a_run(
-    tmp_path: Path, command_line: Cli, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_network_is_trained_on_worlds_and_refines_a_run(tmp_path, command_line, monkeypatch):
     """On a processor that does not compute with bfloat16, training does not either."""
     forward, in_bfloat16 = FusionNet.forward, set()
 

@@ -84,9 +84,7 @@ def evaluate(
 
 @pytest.mark.parametrize("reduction", ["mean", "minimum"])
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.85])
-def test_the_true_depth_and_motion_have_the_least_loss(
-    batch: SnippetBatch, plane, reduction: str, ssim_weight: float
-):
+def test_the_true_depth_and_motion_have_the_least_loss(batch, plane, reduction, ssim_weight):
     config = experiment(reduction=reduction, ssim_weight=ssim_weight)
     truth = float(evaluate(batch, config, 1 / plane.distance, true_poses(), 2).total)
     assert 0 <= truth < 0.02
@@ -103,7 +101,7 @@ def test_the_true_depth_and_motion_have_the_least_loss(
         assert float(outcome.total) > 2 * truth, name
 
 
-def test_networks_get_the_weather_and_the_error_is_of_the_clear_images(batch: SnippetBatch, plane):
+def test_networks_get_the_weather_and_the_error_is_of_the_clear_images(batch, plane):
     seen: list[Tensor] = []
 
     class Watching(FixedDepth):
@@ -127,7 +125,7 @@ def test_networks_get_the_weather_and_the_error_is_of_the_clear_images(batch: Sn
 
 
 @pytest.mark.parametrize("reduction", ["mean", "minimum"])
-def test_gradient_points_towards_truth(batch: SnippetBatch, plane, reduction: str):
+def test_gradient_points_towards_truth(batch, plane, reduction):
     for factor in (0.9, 1.1):
         depth_net = FixedDepth(factor / plane.distance)
         pose_net = FixedPose(factor * true_poses())
@@ -229,7 +227,7 @@ def test_a_row_of_the_paper_weighs_its_terms_as_the_reference_does():
     assert float(outcome.total) == pytest.approx(0.4 * 4 * 4 + 0.2 * smoothness)
 
 
-def test_minimum_tolerates_an_occluded_source(batch: SnippetBatch, plane):
+def test_minimum_tolerates_an_occluded_source(batch, plane):
     sources = batch.sources.clone()
     sources[:, 0, :, 20:40, 30:60] = 0
     hidden = SnippetBatch(batch.target, sources, batch.K)
@@ -240,7 +238,7 @@ def test_minimum_tolerates_an_occluded_source(batch: SnippetBatch, plane):
         assert (covered < 1.5 * clear) is forgives
 
 
-def test_no_visible_points_no_loss(batch: SnippetBatch):
+def test_no_visible_points_no_loss(batch):
     """All points behind both sources: no error, and gradients that are numbers."""
     vectors = torch.tensor([[0, 0, -100.0, 0, 0, 0]] * 2).double()
     for reduction in ("minimum", "mean"):
@@ -253,7 +251,7 @@ def test_no_visible_points_no_loss(batch: SnippetBatch):
         assert torch.isfinite(pose_net.vectors.grad).all()
 
 
-def test_the_mask_keeps_what_moves(batch: SnippetBatch, plane):
+def test_the_mask_keeps_what_moves(batch, plane):
     """A passenger's view: the left half travels with the camera, the right half passes by."""
     sources = batch.sources.clone()
     sources[..., :48] = batch.target[:, None, :, :, :48]
@@ -273,7 +271,7 @@ def test_the_mask_keeps_what_moves(batch: SnippetBatch, plane):
 
 
 @pytest.mark.parametrize("reduction", ["mean", "minimum"])
-def test_what_is_fixed_to_the_camera_has_no_error(batch: SnippetBatch, reduction: str):
+def test_what_is_fixed_to_the_camera_has_no_error(batch, reduction):
     """The lower half is hidden by something that no motion explains."""
     half = batch.target.shape[2] // 2
     fixed = torch.zeros_like(batch.target[:, :1], dtype=torch.bool)
@@ -290,7 +288,7 @@ def test_what_is_fixed_to_the_camera_has_no_error(batch: SnippetBatch, reduction
     assert float(known.terms["photometric"]) == pytest.approx(float(other.terms["photometric"]))
 
 
-def test_autocast_does_not_reach_the_geometry(plane, batch: SnippetBatch):
+def test_autocast_does_not_reach_the_geometry(plane, batch):
     single = SnippetBatch(batch.target.float(), batch.sources.float(), batch.K.float())
     config = experiment(ssim_weight=0.85)
     depth_net, pose_net = FixedDepth(1 / plane.distance).float(), FixedPose(true_poses().float())
@@ -319,7 +317,7 @@ def _taught(views: str = "many", networks: str = "both", **loss: Any) -> Experim
 
 
 @pytest.mark.parametrize("views", ["exact", "many"])
-def test_labels_have_one_unit_that_depth_and_motion_must_have(batch: SnippetBatch, views: str):
+def test_labels_have_one_unit_that_depth_and_motion_must_have(batch, views):
     vectors = torch.tensor(
         [[0.3, 0.0, -0.1, 0.0, 0.1, 0.0], [-0.3, 0.0, 0.1, 0.0, -0.1, 0.0]]
     ).double()
@@ -342,7 +340,7 @@ def test_labels_have_one_unit_that_depth_and_motion_must_have(batch: SnippetBatc
     )  # the unit is not the depth's
 
 
-def test_many_views_warp_the_images_by_the_measured_motion(batch: SnippetBatch, plane):
+def test_many_views_warp_the_images_by_the_measured_motion(batch, plane):
     in_heights = true_poses() * torch.tensor([10.0] * 3 + [1] * 3)
     T_source_target = pose_vector_to_matrix(in_heights)[None].expand(2, 2, 4, 4)
     shape = (2, 1, *batch.target.shape[-2:])

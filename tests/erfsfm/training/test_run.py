@@ -126,7 +126,7 @@ def interrupted(
         train(config, output, device="cpu")
 
 
-def test_the_folder_can_be_used(both: Configure, tmp_path: Path):
+def test_the_folder_can_be_used(both, tmp_path):
     config = both()
     output = train(config, tmp_path / "run", device="cpu", command="erfsfm train")
     assert output == tmp_path / "run"
@@ -149,7 +149,7 @@ def test_the_folder_can_be_used(both: Configure, tmp_path: Path):
     assert any(row["validation/abs_rel"] for row in rows)
 
 
-def test_two_runs_are_equal(alone: Configure, tmp_path: Path):
+def test_two_runs_are_equal(alone, tmp_path):
     config = alone(training={"steps": 2})
     for name in ("a", "b"):
         train(config, tmp_path / name, device="cpu")
@@ -164,13 +164,7 @@ def test_two_runs_are_equal(alone: Configure, tmp_path: Path):
     [pytest.param("constant", "none", 0, marks=pytest.mark.slow), ("cosine", "batch", 0.8)],
 )
 def test_resume_ends_with_identical_weights(
-    both: Configure,
-    small: Small,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    schedule: str,
-    normalisation: str,
-    average_decay: float,
+    both, small, tmp_path, monkeypatch, schedule, normalisation, average_decay
 ):
     """Interrupted at step 5 of 6; the last checkpoint is of step 4, where there also was a validation."""
     small["network"]["normalisation"] = normalisation
@@ -201,9 +195,7 @@ def test_resume_ends_with_identical_weights(
 
 
 @pytest.mark.slow
-def test_the_average_of_the_weights_is_what_is_measured_and_written(
-    both: Configure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_the_average_of_the_weights_is_what_is_measured_and_written(both, tmp_path, monkeypatch):
     def steps_of(name: str, **training: Any) -> Path:
         return train(both(training=training), tmp_path / name, device="cpu") / "last"
 
@@ -223,7 +215,7 @@ def test_the_average_of_the_weights_is_what_is_measured_and_written(
     torch.testing.assert_close(weights_of(tmp_path / "cut" / "last"), expected)
 
 
-def test_a_folder_that_another_training_writes_to_is_refused(alone: Configure, tmp_path: Path):
+def test_a_folder_that_another_training_writes_to_is_refused(alone, tmp_path):
     with FolderLock() as lock:
         lock.take(tmp_path / "run")
         with pytest.raises(BusyError, match="run"):
@@ -267,12 +259,7 @@ def saved(config: ExperimentConfig, networks: TrainedNetworks, folder: Path) -> 
     ],
 )
 def test_best_depth_and_best_pose_are_kept_apart(
-    both: Configure,
-    world: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    networks: str,
-    steps: dict[str, int],
+    both, world, tmp_path, monkeypatch, networks, steps
 ):
     scripted_validation(
         monkeypatch, "abs_rel", [0.3, 0.2, 0.5, 0.4] if networks != "pose" else [0.3] * 4
@@ -311,7 +298,7 @@ class Clock:
 
 @pytest.mark.slow
 def test_a_time_limit_ends_a_run_with_its_schedule_also_after_a_resume(
-    small: Small, world: Path, held_out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small, world, held_out, tmp_path, monkeypatch
 ):
     """Three seconds, at a second a step, are three steps, whatever the number of steps allowed."""
     roots = [world, held_out]
@@ -345,7 +332,7 @@ def test_a_time_limit_ends_a_run_with_its_schedule_also_after_a_resume(
     ("schedule", "factors"),
     [("constant", (1, 1, 1, 1)), ("step", (1, 1, 0.1, 0.1)), ("cosine", (1, 0.51, 0.163518, 0.02))],
 )
-def test_learning_rate_factor(schedule: str, factors: tuple[float, ...]):
+def test_learning_rate_factor(schedule, factors):
     for progress, factor in zip((0, 0.5, 0.75, 1), factors):
         assert learning_rate_factor(schedule, progress) == pytest.approx(factor, abs=1e-5)
 
@@ -358,7 +345,7 @@ def test_a_cosine_begins_with_a_warm_up():
 
 
 def test_initial_weights_pass_on_their_leak_record_and_the_size_of_single_images(
-    alone: Configure, small: Small, held_out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    alone, small, held_out, tmp_path, monkeypatch
 ):
     first = train(alone(training={"steps": 1}), tmp_path / "first", device="cpu")
     larger, model = DepthInput(height=64, width=208, disparity=0.8), load_model(first)
@@ -380,7 +367,7 @@ def test_initial_weights_pass_on_their_leak_record_and_the_size_of_single_images
 
 
 def test_resume_with_other_data_keeps_the_leak_record(
-    alone: Configure, small: Small, held_out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    alone, small, held_out, tmp_path, monkeypatch
 ):
     interrupted(monkeypatch, alone(), tmp_path / "run", 3)
     other = configure(small, [held_out], data={"validation": []})
@@ -391,9 +378,7 @@ def test_resume_with_other_data_keeps_the_leak_record(
     ]
 
 
-def test_a_non_finite_loss_stops_the_run(
-    alone: Configure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_non_finite_loss_stops_the_run(alone, tmp_path, monkeypatch):
     original = SelfSupervision.training_step
 
     def poisoned(self: SelfSupervision, batch: dict[str, Tensor], index: int) -> Tensor:
@@ -410,9 +395,7 @@ def test_a_non_finite_loss_stops_the_run(
     train(alone(), tmp_path / "run", resume=True, device="cpu")
 
 
-def test_a_training_that_ends_in_constant_depth_says_so(
-    alone: Configure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_training_that_ends_in_constant_depth_says_so(alone, tmp_path, monkeypatch):
     """Far shorter than the hundred steps after which one is stopped."""
     original = DepthNet.forward
 
@@ -428,10 +411,7 @@ def test_a_training_that_ends_in_constant_depth_says_so(
 
 
 def test_small_shared_memory_is_said_and_does_not_stop_a_training(
-    alone: Configure,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+    alone, tmp_path, monkeypatch, caplog
 ):
     """Data loaders that hand over batches by it would end, and the training wait for them for ever."""
     free = SimpleNamespace(free=50_000)
@@ -442,9 +422,7 @@ def test_small_shared_memory_is_said_and_does_not_stop_a_training(
 
 @pytest.mark.usefixtures("as_in_the_foreground")
 @pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
-def test_a_signal_ends_a_training_in_order(
-    alone: Configure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, code: int
-):
+def test_a_signal_ends_a_training_in_order(alone, tmp_path, monkeypatch, name, code):
     original = SelfSupervision.training_step
 
     def signalled(self: SelfSupervision, batch: dict[str, Tensor], index: int) -> Tensor:
@@ -463,9 +441,7 @@ def test_a_signal_ends_a_training_in_order(
 
 
 @pytest.mark.slow
-def test_a_loader_that_is_killed_is_said_in_one_line(
-    alone: Configure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_loader_that_is_killed_is_said_in_one_line(alone, tmp_path, monkeypatch):
     original = SelfSupervision.training_step
 
     def killing(self: SelfSupervision, batch: dict[str, Tensor], index: int) -> Tensor:
@@ -493,7 +469,7 @@ def cut(
     return config, Path(shutil.copytree(drives / "cut", tmp_path / "run"))
 
 
-def test_weights_are_not_overwritten(alone: Configure, tmp_path: Path):
+def test_weights_are_not_overwritten(alone, tmp_path):
     """A short run leaves no checkpoint, but it leaves weights."""
     config = alone(training={"steps": 1})
     train(config, tmp_path / "run", device="cpu")
@@ -502,7 +478,7 @@ def test_weights_are_not_overwritten(alone: Configure, tmp_path: Path):
         train(config, tmp_path / "run", device="cpu")
 
 
-def test_resume_with_other_networks(cut: tuple[ExperimentConfig, Path]):
+def test_resume_with_other_networks(cut):
     config, output = cut
     network = config.network.model_copy(update={"pose": "erf-posenet-dilated"})
     with pytest.raises(ConfigError, match="networks"):
@@ -510,7 +486,7 @@ def test_resume_with_other_networks(cut: tuple[ExperimentConfig, Path]):
 
 
 @pytest.mark.parametrize("text", ["", "[1]", "network: {}", "network: {}\ntraining: 1"])
-def test_resume_with_a_damaged_configuration(cut: tuple[ExperimentConfig, Path], text: str):
+def test_resume_with_a_damaged_configuration(cut, text):
     config, output = cut
     (output / "config.yaml").write_text(text)
     with pytest.raises(TrainingError, match=r"config\.yaml is damaged"):
@@ -534,9 +510,7 @@ def refused_checkpoint(cut: tuple[ExperimentConfig, Path]) -> None:
 
 
 @pytest.mark.parametrize("kind", ["torch", "pickle"])
-def test_code_in_a_checkpoint_never_runs(
-    cut: tuple[ExperimentConfig, Path], tmp_path: Path, kind: str
-):
+def test_code_in_a_checkpoint_never_runs(cut, tmp_path, kind):
     path = cut[1] / "checkpoints" / "last.ckpt"
     state = torch.load(path, weights_only=True) | {"extra": Malicious(tmp_path / "executed")}
     if kind == "torch":
@@ -548,9 +522,7 @@ def test_code_in_a_checkpoint_never_runs(
 
 
 @pytest.mark.parametrize("workers", [0, 1])
-def test_a_broken_image_is_one_line(
-    small: Small, tmp_path: Path, write_root: Callable[..., Path], workers: int
-):
+def test_a_broken_image_is_one_line(small, tmp_path, write_root, workers):
     root = write_root(tmp_path / "root", frames=4)
     for index in (1, 2):
         (root / f"sequences/00/image_2/{index:06d}.png").write_bytes(b"broken")
@@ -567,7 +539,7 @@ def test_a_broken_image_is_one_line(
         (["folder/mine"], "unknown"),
     ],
 )
-def test_licence_of(seen: list[str], licence: str):
+def test_licence_of(seen, licence):
     assert licence_of(seen).startswith(licence)
 
 
@@ -582,7 +554,7 @@ if __name__ == '__main__':
 
 
 @pytest.mark.slow
-def test_two_processes_are_one_with_twice_the_batch(both: Configure, tmp_path: Path):
+def test_two_processes_are_one_with_twice_the_batch(both, tmp_path):
     """Batches of 2 in each of two processes; of 4 in one. Lightning starts the script again for a second device."""
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -45,9 +43,7 @@ def noisy(T: np.ndarray) -> np.ndarray:
         (se3.invert, agreement.WRONG),  # the drive backwards
     ],
 )
-def test_lidar_is_compared_with_the_steps_of_the_images(
-    made: Callable[[np.ndarray], np.ndarray], least: float
-):
+def test_lidar_is_compared_with_the_steps_of_the_images(made, least):
     motions = {
         (k, k + 1): Motion(
             RelativePose(k, k + 1, T, np.full(6, 0.01), "essential"), 1e-4 * np.eye(6)
@@ -70,9 +66,7 @@ def test_lidar_is_compared_with_the_steps_of_the_images(
         (12.0, None, False),
     ],
 )
-def test_lengths_are_compared_with_the_camera_height(
-    implied: float, stated: float | None, is_wrong: bool
-):
+def test_lengths_are_compared_with_the_camera_height(implied, stated, is_wrong):
     found = agreement.of_height("scale.mode=known", implied, stated, 0.02)
     assert found.is_wrong == is_wrong and (is_wrong or found.sigmas < agreement.DOUBTFUL)
 
@@ -96,6 +90,7 @@ def driven(
     on_road: int = FRAMES,
     segments: int = 1,
     contradicted: int = 0,
+    leap: float = 0.1,
     aside: int = 0,
     weak: int = 0,
     focal_sigma: float = 0.0,
@@ -116,8 +111,8 @@ def driven(
         segments=[Segment(k, k, "another place") for k in range(segments)],
     )
     camera = replace(CAMERA, focal_sigma=focal_sigma)
-    ends = [pose.ends for pose in poses[:contradicted]]
-    found = agreement.of_images(drive, camera, ends, needs_road=True)
+    leaps = dict.fromkeys([pose.ends for pose in poses[:contradicted]], leap)
+    found = agreement.of_images(drive, camera, leaps, needs_road=True)
     T_steps = STEPS.copy()
     T_steps[:aside, :3, 3] = [0.9, 0.0, 0.0]
     sure = agreement.confidence(
@@ -141,8 +136,13 @@ def driven(
     ],
     ids=str,
 )
-def test_a_drive_whose_images_are_unlike_those_of_good_drives_is_doubtful(doubtful: dict[str, Any]):
+def test_a_drive_whose_images_are_unlike_those_of_good_drives_is_doubtful(doubtful):
     assert driven(**doubtful) < 0.5 < 0.9 < driven(weak=8)
+
+
+def test_the_speed_of_a_vehicle_does_not_leap(caplog):
+    assert driven(contradicted=1, leap=-np.log(2.0)) < 0.02 < driven(contradicted=1)
+    assert "leaps by a factor of 2.0, so the unit holds to 35 %" in caplog.text
 
 
 def found(ratio: float, sigma: float = 0.03) -> FoundCamera:
@@ -162,20 +162,18 @@ def test_a_stated_focal_length_is_contradicted_beyond_three_sigmas_alone():
 
 
 @pytest.mark.parametrize(("sigma", "most"), [(0.03, 0.75), (0.06, 0.43), (0.35, 0.08)])
-def test_an_uncertain_focal_length_stretches_the_road(sigma: float, most: float):
+def test_an_uncertain_focal_length_stretches_the_road(sigma, most):
     sure = agreement.confidence([], is_metric=True, is_carried=False, focal_sigma=sigma)
     assert sure == pytest.approx(most, abs=0.02)
 
 
 @pytest.mark.parametrize(("is_metric", "is_carried"), [(False, False), (True, True)])
-def test_without_metres_and_of_a_carried_camera_no_number_is_said(
-    is_metric: bool, is_carried: bool
-):
+def test_without_metres_and_of_a_carried_camera_no_number_is_said(is_metric, is_carried):
     assert isinstance(agreement.confidence([], is_metric, is_carried), Failed)
 
 
 @pytest.mark.parametrize(("sigmas", "drift"), [(3.5, 0.0), (0.0, 0.035)])
-def test_a_shape_is_doubtful_by_contradictions_and_by_its_drift(sigmas: float, drift: float):
+def test_a_shape_is_doubtful_by_contradictions_and_by_its_drift(sigmas, drift):
     said = [agreement.Agreement("gaps", sigmas, "")]
     assert agreement.shape_confidence(said, drift) < 0.5 < agreement.shape_confidence([], 0.01)
 
@@ -187,9 +185,7 @@ def test_noise_of_creeping_steps_does_not_point_aside():
     assert agreement.of_directions(poses).sigmas < agreement.DOUBTFUL
 
 
-def test_two_contradictions_are_two_warnings(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_two_contradictions_are_two_warnings(monkeypatch, capsys):
     monkeypatch.setattr(logging.getLogger(), "handlers", [])
     Terminal(logging.WARNING)
     for each in (

@@ -45,9 +45,8 @@ def motions(steps: list[Ends], T: FloatArray) -> dict[Ends, Motion]:
 
 def scale(lengths: Mapping[Ends, float] | None = None) -> Scale:
     known = {ends: StepLength(value, 0.02, 0.03) for ends, value in (lengths or {}).items()}
-    return Scale(
-        "camera-height", Failed("drawn"), np.full(FRAMES, METRES), known, "the networks' own unit"
-    )
+    per_frame, unit = np.full(FRAMES, METRES), "the networks' own unit"
+    return Scale("camera-height", Failed("drawn"), per_frame, known, unit, {})
 
 
 STEPS = [(0, 1), (1, 2), (2, 5), (5, 6), (6, 7), (8, 9)]

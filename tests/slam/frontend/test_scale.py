@@ -120,6 +120,20 @@ def test_a_car_taken_for_the_road_for_half_the_drive_is_left_out():
         assert 0 < length.relative_sigma <= length.relative_correlated_sigma
 
 
+def test_the_leap_of_a_unit_is_known():
+    """From step 30 on all lengths are half of what they are."""
+    drive, scans = measured()
+    steps, roads = {}, dict(drive.road_steps)
+    for ends in SINGLE:
+        unit = UNIT if ends[0] < 30 else 0.5 * UNIT
+        moved = Motion(step(ends, unit, "essential"), np.eye(6), seconds=0.1)
+        steps[ends] = replace(moved, length_ratio=(0.0, 0.02))
+    for ends in SINGLE[30:]:
+        roads[ends] = replace(roads[ends], plane=0.5 * roads[ends].plane)
+    scale = find("camera-height", (replace(drive, steps=steps, road_steps=roads), scans))
+    assert scale.contradicted[30, 31] == pytest.approx(-np.log(2.0), abs=0.1)
+
+
 def test_without_a_road_in_the_image_the_learned_road_stands():
     scale = find("camera-height", measured(road=False))
     assert_lengths(scale, TRUE_M, rtol=1e-4)
@@ -134,7 +148,7 @@ def test_without_any_road_lengths_stay_unscaled():
 
 
 @pytest.mark.parametrize("height_m", [0.35, 1.65, 3.2])
-def test_lidar_gives_metres_where_no_road_step_and_no_height_is_known(height_m: float):
+def test_lidar_gives_metres_where_no_road_step_and_no_height_is_known(height_m):
     scale = find("lidar", measured(road=False, bias=height_m / HEIGHT_M, lidar=20), None)
     assert scale.is_metric
     assert_lengths(scale, {ends: metres(ends) for ends in SINGLE}, 0.01)
@@ -200,7 +214,7 @@ def test_a_later_estimate_scales_everything_and_a_failure_nothing():
 
 
 @pytest.mark.parametrize(("share", "unit"), [(0.3, "no metric unit"), (0.7, "camera heights")])
-def test_a_floor_seen_now_and_then_gives_no_metric_unit(share: float, unit: str):
+def test_a_floor_seen_now_and_then_gives_no_metric_unit(share, unit):
     drive, scans = measured(road=False)
     seen = int(share * FRAMES)
     roads = [*drive.measured.roads[:seen], *[Failed("a table")] * (FRAMES - seen)]
@@ -327,7 +341,7 @@ def test_sigmas_are_those_of_the_whole_system():
     np.testing.assert_allclose(with_neighbours, both_sides, atol=1e-9)
 
 
-def test_correlated_sigmas_are_those_of_sums_of_lengths(monkeypatch: pytest.MonkeyPatch):
+def test_correlated_sigmas_are_those_of_sums_of_lengths(monkeypatch):
     """Over 40 steps, independent errors of ``relative_correlated_sigma`` add up as the errors of the lengths do."""
     monkeypatch.setattr("slam.frontend.scale.OUTLIER_SIGMAS", 1e9)
     middle = slice(80, 120)
@@ -347,7 +361,7 @@ def test_correlated_sigmas_are_those_of_sums_of_lengths(monkeypatch: pytest.Monk
     assert np.sqrt(np.square(alone).mean()) > 1.5
 
 
-def test_sigmas_are_those_of_the_errors_of_lengths(monkeypatch: pytest.MonkeyPatch):
+def test_sigmas_are_those_of_the_errors_of_lengths(monkeypatch):
     """Also in the middle of a gap of the road, where there are only triangulation and learned depth."""
     monkeypatch.setattr("slam.frontend.scale.OUTLIER_SIGMAS", 1e9)
     errors, sigmas = [], []
@@ -411,7 +425,7 @@ def test_a_car_may_brake():
 
 
 @pytest.mark.parametrize("stood", [False, True])
-def test_a_unit_that_learned_depth_loses_over_a_gap_is_held_by_the_speed(stood: bool):
+def test_a_unit_that_learned_depth_loses_over_a_gap_is_held_by_the_speed(stood):
     """20 m/s, six steps that nobody measured, then learned depth of a third, tied by points; or a stop between.
 
     Learned depth wanders, as on a road that the network does not know.

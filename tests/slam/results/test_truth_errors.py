@@ -65,7 +65,7 @@ def errors(
     T_world_camera[:, :3, 3] /= scale
     result = SimpleNamespace(
         optimised=SimpleNamespace(T_world_camera=T_world_camera),
-        scale=Scale(mode, ScaleEstimate(1.0, 0.0, 9), np.ones(1), {}, unit),
+        scale=Scale(mode, ScaleEstimate(1.0, 0.0, 9), np.ones(1), {}, unit, {}),
     )
     return MapMetrics.of(
         **map_errors(lambda: iter(np.array_split(points / scale, 3)), result, sequence)

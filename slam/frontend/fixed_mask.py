@@ -53,7 +53,7 @@ _NEAR_MIDDLE = 0.06  # of the width, within which every direction may be that of
 _GAP = 0.025  # of the width, over which fixed edges are joined
 _DEEPEST = 0.4  # of the side of the image that such an edge may hide
 _LEAST_STANDING, _MOST_STANDING = 0.02, 0.6  # of the image, of which a run says something
-_MARGIN = np.ones((3, 3), np.uint8)  # corners beside a fixed pixel see a part of it
+_NEIGHBOURS = np.ones((3, 3), np.uint8)  # of a pixel: corners beside a fixed one see a part of it
 
 _Layer = NDArray[np.float32]
 
@@ -131,7 +131,7 @@ class FixedMask:
             fixed |= np.rot90(_beyond_edge(np.rot90(length, turns), np.rot90(world, turns)), -turns)
         if not fixed.any():
             return None
-        return np.asarray(cv2.dilate(fixed.view(np.uint8), _MARGIN), np.bool_)
+        return np.asarray(cv2.dilate(fixed.view(np.uint8), _NEIGHBOURS), np.bool_)
 
 
 def warn_of_fixed(fixed: Mask | None) -> None:
@@ -169,8 +169,8 @@ def _beyond_edge(length: _Layer, world: Mask) -> Mask:
 
 def _best_sums(sums: _Layer, column: _Layer) -> _Layer:
     """Sums ``(h,)`` along the best paths to each pixel of a column, by those to the column before."""
-    around = np.pad(sums, 1, constant_values=-np.inf)
-    bent = np.maximum(around[:-2], around[2:]) - _BEND
+    # the sum itself is among them, and never the largest with a bend
+    bent = cv2.dilate(sums, _NEIGHBOURS).ravel() - _BEND
     return column + np.maximum(bent, sums)
 
 

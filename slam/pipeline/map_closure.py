@@ -122,11 +122,8 @@ class _Rows:
             ends = slice(last, last + 2)
             if np.isin(self.maps[ends], closed).all() and len(set(self._worlds[ends])) == 1:
                 first, final = self.track.frames[ends].tolist()
-                between = []
-                for pose in self._poses:
-                    if first <= pose.from_index and pose.to_index <= final:
-                        between.append(pose.sigmas)
-                sigmas = np.linalg.norm(between, axis=0)
+                between = [p for p in self._poses if first <= p.from_index and p.to_index <= final]
+                sigmas = np.linalg.norm([pose.sigmas for pose in between], axis=0)
                 T_last_next = invert(T[last]) @ T[last + 1]
                 pose = RelativePose(first, final, T_last_next, sigmas, KEYFRAME_SOURCE)
                 links.append(Loop(pose, 0, 0.0))
@@ -170,7 +167,8 @@ def _closed(
     one, other = rows.maps[rows.track.rows(across)].T
     joining = csr_array((np.ones(len(one)), (one, other)), shape=(count, count))
     _, group = connected_components(joining, directed=False)
-    closed, wrong = [], []
+    closed = []
+    wrong: list[Loop] = []
     for number in np.unique(group):
         members = np.flatnonzero(group == number)
         inside = list(compress(across, group[one] == number))
@@ -179,9 +177,7 @@ def _closed(
             continue
         joined, kept = _joined(rows, inside, members, intrinsics)
         closed.append(joined)
-        for loop, ratio in zip(inside, kept, strict=False):
-            if ratio < _LEAST_KEPT:
-                wrong.append(loop)
+        wrong += compress(inside, np.less(kept, _LEAST_KEPT))
     return closed, wrong
 
 

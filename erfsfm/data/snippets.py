@@ -65,7 +65,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
             config.data.cache_mb - depth_mb - (0 if many_views is None else labels_mb(config.data))
         )
         self._cache = ArrayCache(images_mb, (*size, 3), np.uint8)
-        self._unreadable = set[str]()
+        self._unreadable: set[str] = set()
         self._depth = ArrayCache(
             depth_mb, size, np.float32
         )  # true depth, inverse depth that is imitated
@@ -212,8 +212,8 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
             for first in range(len(recording) - length + 1):
                 windows.append(Snippet(recording, first))
         chosen = np.linspace(0, len(windows) - 1, min(_VALIDATED, len(windows)))
-        self.snippets = list[Snippet]()
-        reasons = list[str]()
+        self.snippets: list[Snippet] = []
+        reasons: list[str] = []
         for i in chosen.round():
             snippet = windows[int(i)]
             try:

@@ -96,6 +96,21 @@ class Unit:
     stated_m: float | None = None
     metres: Callable[[FloatArray], ScaleEstimate | Failed] | None = None
 
+    @property
+    def by_lidar(self) -> bool:
+        """Whether steps by LiDAR give all lengths."""
+        return self.mode == "lidar"
+
+    @property
+    def by_gps(self) -> bool:
+        """Whether a GPS track gives all lengths."""
+        return self.mode == "gps"
+
+    @property
+    def gives_metres(self) -> bool:
+        """Whether lengths are to be metres."""
+        return self.mode != "none"
+
 
 class StepLength(NamedTuple):
     """A length, its relative sigma, and the sigma of independent errors that add up as its correlated ones do."""
@@ -160,7 +175,7 @@ def find_scale(unit: Unit, drive: Drive, lidar_steps: Sequence[RelativePose] = (
         lidar_steps: steps by LiDAR, metres.
     """
     motions, frames = drive.triangulated, len(drive)
-    lidar_steps = lidar_steps if unit.mode == "lidar" else ()
+    lidar_steps = lidar_steps if unit.by_lidar else ()
     height_m = height_by_lidar(lidar_steps, drive) or unit.stated_m
     height = height_m or 1.0
     absolute = _absolute_lengths(drive.road_steps, height, lidar_steps)

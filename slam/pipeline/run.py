@@ -224,13 +224,13 @@ class SlamPipeline:
         if track is not None:
             self._fixes = GpsFixes(track, sequence.stamps, self._config.gps)
         self.unit = unit_of(self._config.scale, sequence, self._fixes)
-        if track is not None and self.unit.mode == "none":
+        if track is not None and not self.unit.gives_metres:
             raise SlamError(
                 "a GPS track is in metres: choose scale.mode=gps with it, or another mode in metres"
             )
         if self._config.lidar.factors:
             require_scans("lidar.factors=true", sequence)
-            if self.unit.mode == "none":
+            if not self.unit.gives_metres:
                 raise SlamError(
                     f"lidar.factors=true is in metres, and lengths of {sequence.name} are in camera heights: "
                     "choose scale.mode=lidar or give a camera height"
@@ -318,7 +318,7 @@ class SlamPipeline:
             return None
         if isinstance(scale.estimate, Failed):
             return scale.estimate
-        return self._fixes.locate(T_odometry, self.unit.mode == "gps")
+        return self._fixes.locate(T_odometry, self.unit.by_gps)
 
     def _optimised(
         self,
@@ -340,7 +340,7 @@ class SlamPipeline:
         if isinstance(location, Location) and in_graph:
             location = replace(location, T_enu_world=graph.T_fixed_world)
         elif isinstance(location, Location):
-            location = location.fixes.locate(T_optimised, self.unit.mode == "gps")
+            location = location.fixes.locate(T_optimised, self.unit.by_gps)
         return graph, T_optimised, loops.without(graph.dropped), location
 
     def _mapped(self, estimate: Estimate, recorder: Recorder) -> Estimate:
@@ -356,7 +356,7 @@ class SlamPipeline:
         Raises:
             SlamError: lengths by LiDAR alone, or depth from elsewhere, are wrong.
         """
-        steps = usable_steps(lidar, are_needed=self.unit.mode == "lidar")
+        steps = usable_steps(lidar, are_needed=self.unit.by_lidar)
         by_lidar = [agreement.of_steps(LIDAR_SOURCE, steps, drive.triangulated)]
         if (height := height_by_lidar(steps, drive)) is not None:
             by_lidar.append(
@@ -364,9 +364,7 @@ class SlamPipeline:
             )
         worst = max(filter(None, by_lidar), key=lambda each: each.sigmas, default=None)
         compared = (
-            []
-            if worst is None
-            else [worst.required() if self.unit.mode == "lidar" else worst.said()]
+            [] if worst is None else [worst.required() if self.unit.by_lidar else worst.said()]
         )
         source = self._config.depth.source
         if (

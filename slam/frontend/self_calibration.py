@@ -56,8 +56,8 @@ _TURNING = 0.5  # radians beyond which turns are told without the focal length
 _INFLATED, _FLOOR, _SYSTEMATIC = 3.0, 0.03, 0.02
 _BY_TURN = 0.3  # sigma of a window that turns by one degree; less, as it turns more
 _HUBER = 1.5
-# of a stated camera: every how many keyframes of a window, and points in these, which take 3 % of the shortest run that
-# is checked, by keyframes (90 in 300 frames of a street); sigmas beyond which a second window is asked
+# of a stated camera: every how many keyframes of a window, and points in these, which take 3 % of the shortest run with
+# a map that is checked, by keyframes (90 in 300 frames of a street); sigmas beyond which a second window is asked
 _EVERY, _CHECKED, _LEAST_CHECKED, _DOUBTFUL = 2, 240, 60, 1.5
 
 

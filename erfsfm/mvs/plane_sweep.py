@@ -17,7 +17,7 @@ WINDOW_PX = 7
 # changes of the logarithm of inverse depth, denser near the guess; negative is farther. Learned depth is
 # hardly ever wrong by more
 CHANGES: Array = np.array([-1.0, -0.7, *(np.arange(-5, 7) / 10), 0.8, 1.0], dtype=np.float32)
-LARGEST_DIFFERENCE = 0.8  # of normalised grey levels: more is an occlusion
+LARGEST_DIFFERENCE = 1.6  # of normalised grey levels: more is an occlusion
 WEIGHT_UNSEEN = 0.5  # of the cost of the guess, in views
 COST_OF_CHANGE = 0.1  # a unit of log inverse depth
 _OUTSIDE = 1e3

@@ -22,7 +22,7 @@ SWEEP_SIGMA = 0.06  # of log inverse depth, before the Gauss-Newton step
 LARGEST_STEP = 0.08
 INDEPENDENT_PIXELS = 3.0  # of a window: residuals of neighbouring pixels are correlated
 SIGMA_FLOOR = 0.03
-LEAST_FIT = 0.4  # mean weight of the neighbours below which no depth explains them: the guess stays
+LEAST_FIT = 0.45  # mean weight of neighbours below which no depth explains them: the guess stays
 LEAST_PRIOR_SIGMA = 0.15
 
 

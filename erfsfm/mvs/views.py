@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 Grey = NDArray[np.uint8]
 Array = NDArray[np.float32]
 
-NEIGHBOURHOOD_PX = 3.0  # standard deviation of the Gaussian window
-CONTRAST_FLOOR = 4.0  # grey levels: what is less is noise
+NEIGHBOURHOOD_PX = 2.0  # standard deviation of the Gaussian window
+CONTRAST_FLOOR = 2.0  # grey levels: what is less is noise
 
 BASELINES = (0.07, 0.2)  # wanted distances over the median depth
 _RANGE = 2.5  # accepted factor on these

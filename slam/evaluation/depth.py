@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
@@ -15,6 +16,8 @@ from slam.runtime.record import Count, Record
 LEAST_M, LARGEST_M = 1.0, 80.0
 _RANGES_M = LEAST_M, 5.0, 10.0, 20.0, 40.0, LARGEST_M  # between which errors are told apart
 COVERAGES = (50, 90, 95)
+_NEAR = 0.005  # of the width: pixels this far around tell a smooth surface from a broken one
+_SMOOTH = 1.5  # largest ratio of their true depths; a road seen by a car has less up to 45 m
 _PIXELS_OF_A_FRAME = 3000
 _MOST_FRAMES = 500  # held; of a longer drive every second frame, every fourth, and so on
 
@@ -22,7 +25,8 @@ _MOST_FRAMES = 500  # held; of a longer drive every second frame, every fourth, 
 class DepthMetrics(Record):
     """The object D of ``metrics.json``; ``coverage`` is the share of errors inside so many per cent of the noise.
 
-    ``by_range`` is ``abs_rel`` of true depths in metres: ``1-5``, ``5-10`` and so on.
+    ``by_range`` is ``abs_rel`` of true depths in metres: ``1-5``, ``5-10`` and so on; also of ``smooth`` surfaces, and
+    of ``broken`` ones, which are outlines, thin things, fences and leaves.
     """
 
     abs_rel: float | None = None
@@ -42,7 +46,7 @@ class DepthErrors:
 
     def __init__(self) -> None:
         self._depths: list[NDArray[np.float32]] = []
-        self._frames, self._step = 0, 1
+        self._frames, self._step = -1, 1
 
     def add(
         self,
@@ -62,7 +66,7 @@ class DepthErrors:
         if len(v) == 0:
             return
         self._frames += 1
-        if (self._frames - 1) % self._step:
+        if self._frames % self._step:
             return
         thinned = np.linspace(0, len(v) - 1, min(len(v), _PIXELS_OF_A_FRAME)).astype(int)
         v, u = v[thinned], u[thinned]
@@ -71,7 +75,11 @@ class DepthErrors:
         sigma = np.full(len(v), np.nan) if relative_sigma is None else relative_sigma[at]
         known = np.isfinite(depth[at]) & (depth[at] > 0) & ~np.isinf(sigma)
         estimate = np.minimum(depth[at], LARGEST_M)
-        self._depths.append(np.stack([estimate, truth[v, u], sigma])[:, known].astype(np.float32))
+        around = np.ones((2 * round(_NEAR * true_width) + 1,) * 2, np.uint8)
+        least = cv2.erode(np.where(truth > 0, truth, np.inf), around)
+        is_broken = (cv2.dilate(truth, around) > _SMOOTH * least)[v, u]
+        of_frame = np.stack([estimate, truth[v, u], sigma, is_broken])[:, known]
+        self._depths.append(of_frame.astype(np.float32))
         if len(self._depths) > _MOST_FRAMES:
             self._depths, self._step = self._depths[::2], 2 * self._step
 
@@ -79,14 +87,13 @@ class DepthErrors:
         """The errors over all pixels; None where no frame had truth."""
         if not any(part.size for part in self._depths):
             return None
-        depth, truth, sigma = np.concatenate(self._depths, axis=1).astype(np.float64)
+        depth, truth, sigma, is_broken = np.concatenate(self._depths, axis=1).astype(np.float64)
         relative = np.abs(depth - truth) / truth
-        ratio = np.maximum(depth / truth, truth / np.maximum(depth, 1e-9))
-        by_range = {}
+        ratio = np.maximum(depth / truth, truth / depth)
+        parts = {"smooth": is_broken == 0, "broken": is_broken > 0}
         for near, far in pairwise(_RANGES_M):
-            inside = (truth >= near) & (truth < far)
-            if inside.any():
-                by_range[f"{near:g}-{far:g}"] = float(relative[inside].mean())
+            parts[f"{near:g}-{far:g}"] = (truth >= near) & (truth < far)
+        means = {name: float(relative[part].mean()) for name, part in parts.items() if part.any()}
         coverage: dict[str, float] | Failed = Failed("the network states no noise of its depth")
         if not np.isnan(sigma).any():
             errors = np.log(ratio) / sigma
@@ -98,7 +105,7 @@ class DepthErrors:
             median_rel=median(relative),
             rmse_m=rms(depth - truth),
             a1=float((ratio < 1.25).mean()),
-            by_range=by_range,
+            by_range=means,
             coverage=coverage,
             frames=len(self._depths),
         )

@@ -27,7 +27,7 @@ _CERTAIN_SIGMA = 0.06  # of depth that is fused beyond the largest depth, over t
 _BORDER = 0.02  # left, right and above, over the image's width
 _SKY_BRIGHTNESS = 245  # least level of all colours of sky
 _SKY_BLUENESS = 15  # or least blue less red of such a pixel, grey levels
-_MAX_DEPTH_STEP = 0.12  # relative, between neighbouring pixels of one surface
+_MAX_DEPTH_RATIO = 1.12  # largest ratio of neighbouring pixels of one surface
 _MAX_DEPTH_DIFFERENCE = 0.1  # relative, to the depth of a neighbouring keyframe
 _OUTSIDE = -9.0  # a column left of every image
 _DARK_BLUE = 110  # grey levels below which nothing is the sky by day
@@ -176,16 +176,9 @@ def sampled(image: NDArray[Any], u: DepthMap, v: DepthMap) -> NDArray[Any]:
 
 def _at_edges(depth: DepthMap) -> Mask:
     """Pixels on either side of a relative depth step, where networks blur depth."""
-    edges = np.zeros(depth.shape, dtype=bool)
-    for near, far in (
-        ((slice(None), slice(1, None)), (slice(None), slice(-1))),
-        ((slice(1, None),), (slice(-1),)),
-    ):
-        a, b = depth[near], depth[far]
-        step = np.abs(a - b) > _MAX_DEPTH_STEP * np.minimum(a, b)
-        edges[near] |= step
-        edges[far] |= step
-    return edges
+    beside = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    nearest, farthest = cv2.erode(depth, beside), cv2.dilate(depth, beside)
+    return (farthest > _MAX_DEPTH_RATIO * depth) | (depth > _MAX_DEPTH_RATIO * nearest)
 
 
 class DepthRefiner:

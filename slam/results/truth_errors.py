@@ -218,17 +218,14 @@ class DepthQuality:
     def metrics(self, is_refined: bool) -> DepthOfKeyframes:
         """The errors, each missing with a reason where it cannot be computed; warns of unread maps."""
         network, refined = self._network.metrics(), self._refined.metrics()
-        unreadable = f"the true depth of {len(self._unreadable)} keyframes cannot be read"
-        if self._unreadable:
-            logger.warning("%s, first %s: they are not compared", unreadable, self._unreadable[0])
+        missing = "the sequence has no true depth (simulated, depth_2 or LiDAR)"
         if self._keyframes == 0:
             missing = "there are no keyframes (mapping.enabled)"
         elif not self._is_metric:
             missing = "depth is not in metres (see scale)"
         elif self._unreadable:
-            missing = unreadable
-        else:
-            missing = "the sequence has no true depth (simulated, depth_2 or LiDAR)"
+            missing = f"the true depth of {len(self._unreadable)} keyframes cannot be read"
+            logger.warning("%s, first %s: they are not compared", missing, self._unreadable[0])
         if network is None:
             return DepthOfKeyframes.unknown(missing)
         unrefined = (
@@ -247,7 +244,7 @@ def true_depth(sequence: FrameSequence, index: int, count: int = 1) -> DepthMap 
     if isinstance(sequence, RecordedSequence) and index in sequence.true_depth_frames():
         if sequence.is_rendered and count % _EVERY_RENDERED != 1:
             return None
-        return np.asarray(sequence.true_depth(index), np.float32)
+        return sequence.true_depth(index).astype(np.float32)
     if sequence.T_camera_lidar is None or not sequence.has_scan(index):
         return None
     return projected(sequence.scan(index), sequence.T_camera_lidar, sequence.intrinsics)
@@ -257,7 +254,7 @@ def projected(
     points_lidar: FloatArray, T_camera_lidar: FloatArray, intrinsics: Intrinsics
 ) -> DepthMap:
     """z-depth ``(H, W)`` of LiDAR points ``(P, 3)`` in the image, the nearest at each pixel, 0 where there is none."""
-    points = apply(T_camera_lidar, np.asarray(points_lidar, np.float64))
+    points = apply(T_camera_lidar, points_lidar)
     points = points[_in_image(points, intrinsics)]
     u, v = np.rint(intrinsics.project(points)).astype(int).T
     depth = np.full((intrinsics.height, intrinsics.width), np.inf, np.float32)

@@ -54,7 +54,7 @@ def test_what_is_unknown_begins_with_its_neighbours_and_is_not_believed_unmeasur
 def test_how_far_depth_is_fused_depends_on_its_sigma(monkeypatch):
     camera = Intrinsics(100, 50, 80.0, 80.0, 49.5, 24.5)
     depth = np.repeat(np.linspace(15, 40, 100, dtype=np.float32)[None], 50, axis=0)
-    monkeypatch.setattr("slam.mapping.depth._MAX_DEPTH_STEP", 10.0)
+    monkeypatch.setattr("slam.mapping.depth._MAX_DEPTH_RATIO", 10.0)
     config = MappingConfig(depth_max_m=20)
     image = np.full((50, 100, 3), 90, np.uint8)
 

@@ -109,8 +109,8 @@ def test_flying_pixels_and_far_depth_are_left_out(monkeypatch):
     smeared[:, :3], smeared[:, -3:] = 14.0, 14.0
     smeared[:8] = 60.0  # sky
 
-    def fuse(max_depth_step):
-        monkeypatch.setattr("slam.mapping.depth._MAX_DEPTH_STEP", max_depth_step)
+    def fuse(largest_ratio):
+        monkeypatch.setattr("slam.mapping.depth._MAX_DEPTH_RATIO", largest_ratio)
         monkeypatch.setattr("slam.mapping.depth._MAX_DEPTH_DIFFERENCE", 10.0)
         monkeypatch.setattr(surface, "_LEAST_TRIANGLES", 0)
         monkeypatch.setattr(submap, "TRUNCATION_VOXELS", 4.5)
@@ -122,9 +122,9 @@ def test_flying_pixels_and_far_depth_are_left_out(monkeypatch):
     def between(vertices):
         return ((vertices[:, 2] > 7.5) & (vertices[:, 2] < 12.5)).sum()
 
-    assert between(fuse(max_depth_step=10.0)) > 100
-    assert between(fuse(max_depth_step=0.12)) == 0
-    assert fuse(max_depth_step=0.12)[:, 2].max() < 26
+    assert between(fuse(largest_ratio=11.0)) > 100
+    assert between(fuse(largest_ratio=1.12)) == 0
+    assert fuse(largest_ratio=1.12)[:, 2].max() < 26
 
 
 def test_files_are_written_whole_and_read_back(tmp_path):

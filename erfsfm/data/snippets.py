@@ -114,10 +114,8 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         if self._exact and number % training.batch < training.of_batch(self._config.data.exact):
             recording = self._exact[int(rng.choice(len(self._exact), p=self._exact_probabilities))]
             index = int(rng.integers(len(recording)))
-            bounds, camera = (
-                self._exact_labels.bounds(recording, index),
-                recording.seen_by(self._config.network),
-            )
+            bounds = self._exact_labels.bounds(recording, index)
+            camera = recording.seen_by(self._config.network)
             (image,) = load_window(self._cache, Snippet(recording, index), 1)
             return single_image(image, camera, bounds, self._config, rng)
         snippet, images = first_readable(self._chosen(rng), self._images, self._unreadable)

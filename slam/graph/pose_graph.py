@@ -151,7 +151,7 @@ class PoseGraph:
             SlamError: if the graph was not optimised.
         """
         T_world_camera = self._solution()
-        is_wrong = self._is_loop()
+        is_wrong = np.array([edge.source == LOOP_SOURCE for edge in self.relative_poses], bool)
         is_wrong[is_wrong] = _outlying(
             whitened_squared(compress(self.relative_poses, is_wrong), T_world_camera)
         )
@@ -214,10 +214,6 @@ class PoseGraph:
             information = np.diag(1.0 / edge.graph_sigmas[_TRANSLATION_FIRST] ** 2)[_UPPER]
             lines.append(f"{_EDGE} {ends} {_numbers(pose)} {_numbers(information)}")
         write_atomically(path, "\n".join([*lines, ""]))
-
-    def _is_loop(self) -> BoolArray:
-        """Which of the factors ``(F,)`` are loops."""
-        return np.array([edge.source == LOOP_SOURCE for edge in self.relative_poses], dtype=bool)
 
     def _solution(self) -> FloatArray:
         if self._T_world_camera is None:

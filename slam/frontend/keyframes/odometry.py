@@ -74,10 +74,10 @@ _DOUBTFUL_PARALLAX_RATIO = 0.005
 _MAX_CORNERS = 500  # of a keyframe
 # residual of half of the points where few have parallax, above which corners are sought by dense flow
 _DOUBTFUL_PX = 0.5 * INLIER_PX
-# of the median residual of corners without translation over that with it, where that is no noise:
-# blurred corners always agree on some translation (on the spot mostly 0.4 to 1.3, of a walk 1.5 and
-# more)
-_TURN_RATIO = 1.3
+# of the median residual of corners without translation over that with it, where the latter is no
+# noise: blurred corners always agree on some translation (on the spot mostly 0.4 to 1.3, of a walk
+# 1.5 and more)
+_TURN_RATIO, _NOISE_PX = 1.3, 0.5
 _NOTHING: tuple[TrackIds, Pixels] = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
 
 
@@ -288,7 +288,7 @@ class KeyframeOdometry:
             R = rotation_between(intrinsics.rays(first), intrinsics.rays(seen))
             by_turn = _apart(turned(first, R, intrinsics), pixels)
             is_turn = by_turn < min(_TURN_RATIO * residual_px, INLIER_PX)
-            is_turn &= residual_px > PIXEL_SIGMA
+            is_turn &= residual_px > _NOISE_PX
             if is_turn:  # needs no depth
                 self._T_camera_world = make(R, np.zeros(3)) @ last.T_camera_world
             elif parallax > _DOUBTFUL_PARALLAX_RATIO:

@@ -40,7 +40,9 @@ class Plane:
     def colours(self, t_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
         """The image ``(H, W, 3)`` in [0, 1]."""
         angles = self.points(t_world_camera) @ WAVES.T  # (H, W, 12)
-        waves = np.cos(np.float32(angles[..., None] + PHASES)).mean(axis=2, dtype=float)  # (H, W, 3)
+        waves = np.cos(np.float32(angles[..., None] + PHASES)).mean(
+            axis=2, dtype=float
+        )  # (H, W, 3)
         return 0.5 + 0.4 * np.clip(waves * 2, -1, 1)
 
     def image(self, t_world_camera: NDArray[np.float64]) -> NDArray[np.uint8]:

@@ -159,9 +159,9 @@ def test_two_runs_are_equal(alone, tmp_path):
     assert not same(tmp_path / "a", tmp_path / "c")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "schedule, normalisation, average_decay",
-    [pytest.param("constant", "none", 0, marks=pytest.mark.slow), ("cosine", "batch", 0.8)],
+    "schedule, normalisation, average_decay", [("constant", "none", 0), ("cosine", "batch", 0.8)]
 )
 def test_resume_ends_with_identical_weights(
     both, small, tmp_path, monkeypatch, schedule, normalisation, average_decay

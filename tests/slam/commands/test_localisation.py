@@ -84,9 +84,8 @@ def save(path: Path, image: Image) -> None:
     cv2.imwrite(str(path), np.ascontiguousarray(image[..., ::-1]))
 
 
-@pytest.mark.parametrize(
-    "hazards", [pytest.param((), marks=pytest.mark.slow), ("rain",)]
-)  # the album has another exposure
+@pytest.mark.slow
+@pytest.mark.parametrize("hazards", [(), ("rain",)])  # the album has another exposure
 def test_images_of_the_street_are_localised_where_they_were_taken(hazards: tuple[str, ...]):
     localiser = Localiser(places())
     found = 0

@@ -6,6 +6,7 @@ import functools
 import importlib
 import logging
 import os
+import weakref
 from pathlib import Path
 
 import cv2
@@ -72,7 +73,10 @@ class VideoFrames:
         self.fps = float(self._capture.get(cv2.CAP_PROP_FPS)) or None
         if self._shown_s is not None and self._frames > 1:
             self.fps = (self._frames - 1) / float(self._shown_s[-1] - self._shown_s[0])
-        self._cached = functools.lru_cache(maxsize=_CACHED_FRAMES)(self._decode)
+        # weak, so that a video that nobody reads any more is closed at once: in a data loader, which is a
+        # fork without FFmpeg's threads, closing it would wait for these for ever
+        decode = functools.partial(VideoFrames._decode, weakref.proxy(self))
+        self._cached = functools.lru_cache(maxsize=_CACHED_FRAMES)(decode)
         self.height, self.width = self._cached(0).shape[:2]
         wide = self._capture.get(cv2.CAP_PROP_SAR_NUM)
         high = self._capture.get(cv2.CAP_PROP_SAR_DEN)
@@ -104,7 +108,6 @@ class VideoFrames:
         ahead = index - self._next
         unseen = index >= len(self._times_ms)  # so that no seek could be checked
         if not (ahead >= 0 and (unseen or ahead <= _SKIPPED_FRAMES)) and not self._seek(index):
-            self._capture.release()
             self._capture, self._next = _capture(self._path), 0
         while self._next <= index:
             if not self._grab():
@@ -148,10 +151,11 @@ def _packet_times(path: Path) -> NDArray[np.float64] | None:
     try:
         with av.open(str(path.absolute())) as container:
             stream = container.streams.video[0]
-            packets = (
-                packet for packet in container.demux(stream) if not packet.is_discard
-            )  # trimmed on a phone
-            shown = sorted(packet.pts for packet in packets if packet.pts is not None)
+            shown = sorted(
+                packet.pts
+                for packet in container.demux(stream)
+                if packet.pts is not None and not packet.is_discard  # trimmed on a phone
+            )
             return np.array(shown, dtype=np.float64) * float(stream.time_base)
     except (av.error.FFmpegError, IndexError, TypeError) as error:
         raise DataError(f"video {path} cannot be read: {error}; copy it again") from error

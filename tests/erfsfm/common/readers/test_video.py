@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,14 @@ def test_any_order_gives_the_right_frame(tmp_path: Path, suffix: str, counted_fr
     assert (len(frames), frames.width, frames.height) == (FRAMES, 64, 48)
     for index in [0, 1, 2, 80, 3, 79, 89, 10, 11, 0, 45]:
         assert decoded(frames.read(index)) == index
+
+
+def test_a_video_is_closed_as_soon_as_nobody_reads_it(tmp_path: Path):
+    """Left to the garbage collector it might be closed in a forked data loader, which would hang."""
+    frames = VideoFrames(write_video(tmp_path / "a.avi"))
+    kept = weakref.ref(frames)
+    del frames
+    assert kept() is None
 
 
 def test_a_name_with_colons_is_no_protocol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -14,8 +14,8 @@ export PYTHONDONTWRITEBYTECODE :=
 # Writes requirements.lock with `make lock`; a program, not a part of the environment
 UV ?= uv
 
-# Tests are of one thread each; a file's tests stay together, for they share what they prepare
-PYTEST := $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
+# Tests are of one thread each; neighbours stay together, for they share what they prepare, until a process has no more
+PYTEST := $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist worksteal
 
 .PHONY: setup lock demo fast test quick test-all lint docs benchmark dist publish clean
 

@@ -67,10 +67,7 @@ SHORTER: tuple[tuple[str, str], ...] = (
     (r"^(python tools/benchmark.py maps .*)--parts( '[^']+')+", r"\1--parts"),
 )
 
-FAST = (
-    "README.md",
-    "getting-started.md",
-)  # what a new user reads first; the commands of other pages are slow
+FAST = ("README.md",)  # what a new user reads first; the commands of other pages are slow
 SLOW = (
     r"^erfsfm-slam run(?! --dataset my_drive.mp4 --camera)",  # a whole run each; test_every_command_is_understood
     r"^erfsfm export ",  # tests/erfsfm/test_export.py exports smaller networks

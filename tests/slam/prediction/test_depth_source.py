@@ -381,6 +381,7 @@ def run(world: Path, output: Path, source: str, *overrides: str, **options: Any)
     return run_slam(world, "sim", overrides=given, output=output, **{"weights": "sim", **options})
 
 
+@pytest.mark.slow
 def test_our_exported_network_gives_the_run_of_our_weights(
     world: Path, tiny_weights: Path, exported: Path, tmp_path: Path, check_run: CheckRun
 ):

@@ -49,6 +49,7 @@ def test_a_street_that_turns_shows_its_focal_length():
     assert f"{found.focal * WIDTH / 2:.0f} px ± " in said and "(fov=8" in said
 
 
+@pytest.mark.slow
 def test_a_straight_street_says_that_it_cannot_be_seen():
     found = find_camera(images(replace(STREET, route="straight"), 0, 28))
     assert found.sigma == UNKNOWN_FX_SIGMA

@@ -577,6 +577,7 @@ def counted(calls: Counter[str], name: str, of: Callable[..., Any]) -> Callable[
     return call
 
 
+@pytest.mark.slow
 def test_calls_a_frame(monkeypatch: pytest.MonkeyPatch):
     sequence, calls = (
         SimulatedSequence(SimulationOptions("grid", COUNTED_FRAMES, 610, 312, 96)),

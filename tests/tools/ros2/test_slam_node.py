@@ -258,6 +258,7 @@ def matrix(node_module: ModuleType, message: Any) -> FloatArray:
     return found
 
 
+@pytest.mark.slow
 def test_loops_move_the_map_and_not_the_odometry(
     node_module: ModuleType, kitti_root: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -57,6 +57,7 @@ def check(run: RunFolder, measured: Measured) -> None:
 
 
 @pytest.mark.data
+@pytest.mark.slow
 def test_two_seconds_are_as_right_after_the_graph_as_before(data_root: Path, tmp_path: Path):
     options = {"weights": "sim", "frames": "0:20", "overrides": QUICK, "output": tmp_path / "run"}
     found = run_slam(data_root / "kitti_odometry", "02", **options).metrics().tree()["trajectories"]

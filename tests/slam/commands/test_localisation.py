@@ -207,7 +207,8 @@ def test_images_of_other_places_are_refused(what: str):
         assert result.T_world_camera is None and result.nearest_frame is None and result.reason
 
 
-@pytest.mark.parametrize("zoom", [pytest.param(0.93, marks=pytest.mark.slow), 1.1])
+@pytest.mark.slow
+@pytest.mark.parametrize("zoom", [0.93, 1.1])
 def test_images_by_another_lens_are_refused_where_its_camera_is_not_given(zoom: float):
     camera = places().intrinsics
     middle = np.array([camera.cx, camera.cy])

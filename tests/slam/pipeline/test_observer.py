@@ -181,6 +181,7 @@ def test_ten_frames_are_interpolated_and_reported(damage: Damage):
     assert not {view.index for view in seen.views} & set(BAD)
 
 
+@pytest.mark.slow
 def test_no_road_is_measured_in_the_sky():
     """Of images that are upside down."""
 

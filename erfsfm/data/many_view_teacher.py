@@ -236,8 +236,8 @@ class DriveLabels:
 
     def _greys(self, frames: Iterable[int], camera: Camera) -> dict[int, Grey]:
         """Those frames that can be read."""
-        read = {n: self._image(n, camera) for n in frames}
-        return {n: _grey(image) for n, image in read.items() if image is not None}
+        read = ((n, self._image(n, camera)) for n in frames)
+        return {n: _grey(image) for n, image in read if image is not None}
 
     def _motion(self, target: int, others: Iterable[int]) -> NDArray[np.float64]:
         """``T_other_target`` ``(N, 4, 4)``."""

@@ -5,7 +5,6 @@ Errors may be twice what was measured; the measured figure is the other factor o
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,6 @@ from slam.config.sections import load_config
 from slam.evaluation.map import pose_similarity
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.formats.trajectory import Trajectory, read_trajectory
-from slam.frames import Frame
 from slam.frontend.visual.odometry import ESSENTIAL_SOURCE
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
@@ -38,19 +36,11 @@ NOISE = {
 
 
 class Rendered(SimulatedSequence):
-    """The street with each frame rendered once, when it is first asked for, its depth beside it."""
-
-    def __init__(self, options: SimulationOptions) -> None:
-        super().__init__(options)
-        self._rendered = functools.cache(self.street.render)
-
-    def frame(self, index: int) -> Frame:
-        """A rendered frame."""
-        return Frame(index, float(self.stamps[index]), self._rendered(self.start + index).image)
+    """The street, its depth beside it."""
 
     def depth(self, index: int) -> FloatArray:
         """True z-depth, the sky at 200 m."""
-        depth = self._rendered(self.start + index).depth.astype(np.float64)
+        depth = self.street.depth(self.start + index).astype(np.float64)
         return np.where(depth > 0, depth, 200.0)
 
 

@@ -287,8 +287,8 @@ class KeyframeOdometry:
             seen = pixels.astype(np.float64)
             R = rotation_between(intrinsics.rays(first), intrinsics.rays(seen))
             by_turn = _apart(turned(first, R, intrinsics), pixels)
-            is_turn = by_turn < min(_TURN_RATIO * residual_px, INLIER_PX)
-            is_turn &= residual_px > _NOISE_PX
+            most = min(_TURN_RATIO * residual_px, INLIER_PX)
+            is_turn = residual_px > _NOISE_PX and by_turn < most
             if is_turn:  # needs no depth
                 self._T_camera_world = make(R, np.zeros(3)) @ last.T_camera_world
             elif parallax > _DOUBTFUL_PARALLAX_RATIO:

@@ -46,7 +46,7 @@ class DepthErrors:
 
     def __init__(self) -> None:
         self._depths: list[NDArray[np.float32]] = []
-        self._frames, self._step = -1, 1
+        self._frames, self._step = 0, 1
 
     def add(
         self,
@@ -65,8 +65,9 @@ class DepthErrors:
         v, u = np.nonzero((truth >= LEAST_M) & (truth <= LARGEST_M))
         if len(v) == 0:
             return
+        is_passed_over = self._frames % self._step != 0
         self._frames += 1
-        if self._frames % self._step:
+        if is_passed_over:
             return
         thinned = np.linspace(0, len(v) - 1, min(len(v), _PIXELS_OF_A_FRAME)).astype(int)
         v, u = v[thinned], u[thinned]

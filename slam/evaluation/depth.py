@@ -78,7 +78,7 @@ class DepthErrors:
         estimate = np.minimum(depth[at], LARGEST_M)
         around = np.ones((2 * round(_NEAR * true_width) + 1,) * 2, np.uint8)
         least = cv2.erode(np.where(truth > 0, truth, np.inf), around)
-        is_broken = (cv2.dilate(truth, around) > _SMOOTH * least)[v, u]
+        is_broken = (cv2.dilate(truth, around) / _SMOOTH > least)[v, u]
         of_frame = np.stack([estimate, truth[v, u], sigma, is_broken])[:, known]
         self._depths.append(of_frame.astype(np.float32))
         if len(self._depths) > _MOST_FRAMES:

@@ -44,7 +44,7 @@ _PICTURE_WIDTH = 620
 CAP_HEIGHTS = 50.0  # camera heights: some 80 m from a car's roof
 LARGEST_RATIO = 1.3  # of the bounds of a pixel's depth; wider ones are no truth
 SLAM_WEIGHTS = "default"
-TRUTH_FOLDER = "truth"
+TRUTH_FOLDER = "truth_by_flow"
 # all frames
 _RUN = "--set loops.enabled=false --set mapping.keyframe_distance_m=0.3 --set output.report=false"
 _RATIOS = ("abs_rel", "rmse_log", "a1", "a2", "a3")  # errors without a unit: the scale is fitted

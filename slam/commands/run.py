@@ -100,11 +100,8 @@ class Request(Section):
         """The request of arguments given by name.
 
         Raises:
-            TypeError: an unknown argument.
-            RunError: a value of another kind.
+            RunError: an unknown argument, or a value of another kind.
         """
-        if unknown := arguments.keys() - cls.model_fields.keys():
-            raise TypeError(f"run_slam has no argument {', '.join(sorted(unknown))}")
         try:
             return cls(**arguments)
         except ValidationError as error:

@@ -183,6 +183,7 @@ def evaluate(
         Path | None,
         typer.Option(help="of the rows of KITTI files, as times.txt: compared by stamps"),
     ] = None,
+    csv: Annotated[Path | None, typer.Option(help="all numbers, with --reference")] = None,
     fail_over: Annotated[
         list[str] | None, typer.Option(help="METRIC=VALUE: exit 1 if it is larger; repeat")
     ] = None,
@@ -203,9 +204,9 @@ def evaluate(
     files, limits = [Path(path) for path in paths], fail_over or []
     evaluation.require_metrics(limits)
     if reference is not None:
-        evaluation.against_reference(paths, reference, frames, format, limits, as_json, times)
-    elif frames:
-        raise typer.BadParameter("it needs --reference FILE", param_hint="--frames")
+        evaluation.against_reference(paths, reference, frames, format, limits, as_json, csv, times)
+    elif frames or csv:
+        raise typer.BadParameter("--frames and --csv need --reference FILE")
     elif all(path.is_dir() for path in files):
         if limits:
             raise typer.BadParameter(

@@ -416,6 +416,39 @@ def calibrate(
 
 
 @app.command()
+def download(
+    data_set: Annotated[Literal["kitti-odometry"], typer.Argument(help="the data set")],
+    sequence: Annotated[str, typer.Option("--sequence", "-s", help="such as 09")],
+    to: Annotated[Path, typer.Option(help="folder that gets it")],
+    camera: Annotated[Literal["colour", "grey"], typer.Option(help="which images")] = "colour",
+    lidar: Annotated[bool, typer.Option("--lidar", help="scans as well")] = False,
+    accept_licence: Annotated[
+        bool, typer.Option("--accept-licence", help="you accept the licence that is shown")
+    ] = False,
+    mirror: Annotated[
+        str | None, typer.Option(help="address of the archives, in place of the official one")
+    ] = None,
+) -> None:
+    """One sequence of KITTI odometry from its official server.
+
+    Of its archives only the files of the sequence are fetched. Run again, an interrupted download goes on.
+
+    Example: erfsfm-slam download kitti-odometry --sequence 09 --to KITTI
+    """
+    from slam.commands.download import LICENCE, SERVER, download_kitti
+
+    typer.echo(LICENCE)
+    if not accept_licence:
+        if not sys.stdin.isatty():
+            raise SlamError("the licence above is to be accepted: give --accept-licence")
+        if not typer.confirm("Do you accept it?"):
+            raise SlamError("the licence was not accepted: nothing is downloaded")
+    with progress_bar() as progress:
+        count = download_kitti(sequence, to, mirror or SERVER, camera == "grey", lidar, progress)
+    typer.echo(f"{count} files in {to}: erfsfm-slam run --dataset {to} --sequence {sequence}")
+
+
+@app.command()
 def config() -> None:
     """The full default configuration as YAML.
 

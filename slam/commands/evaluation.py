@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from glob import glob
@@ -14,6 +15,7 @@ import typer
 
 from erfsfm.common.readers.numbering import in_order
 from erfsfm.common.table import Table, csv_of
+from slam.evaluation.mistakes import likely_mistakes
 from slam.evaluation.trajectory import TrajectoryMetrics, evo_commands, exceeded, trajectory_metrics
 from slam.formats.trajectory import Trajectory, associate, read_trajectory
 from slam.results import tables
@@ -21,6 +23,8 @@ from slam.results.folder import RunFolder, check_replaced
 from slam.runtime.errors import ConfigError, RunError, SlamError, TrajectoryError
 from slam.runtime.files import REFERENCE, trajectory_file, write_atomically
 from slam.sequences.recording import frame_range, read_stamps
+
+logger = logging.getLogger(__name__)
 
 
 def require_metrics(limits: Sequence[str]) -> None:
@@ -188,6 +192,9 @@ def compare(
             pair = associate(estimate, truth, chosen)
         except TrajectoryError as error:
             raise TrajectoryError(f"{path}: {error}") from error
+        for mistake in likely_mistakes(estimate, truth, pair):
+            line = f"{path}: {mistake}"
+            logger.warning(line)
         runs.append(SystemRun(name, path, len(pair[0]), trajectory_metrics(*pair)))
     return runs
 

@@ -137,6 +137,9 @@ def batch(
             min=1, help="threads of a drive; default: the cores of this machine by the workers"
         ),
     ] = None,
+    memory: Annotated[
+        float, typer.Option(min=0, help="GiB that a drive may use; 0: all (Linux)")
+    ] = 0.0,
     weights: Annotated[str | None, typer.Option(help="as for run")] = None,
     config: Config = None,
     overrides: Overrides = None,
@@ -150,10 +153,12 @@ def batch(
     """
     from slam.commands.batch import CSV, drives_of, options_of_drives, run_drives, summary_table
 
+    if memory and not Path("/proc/self/statm").exists():
+        raise SlamError("--memory needs Linux: leave it out here")
     options = options_of_drives(weights, config, overrides or [], frames, seed, device)
     planned = drives_of(drives, sequence or ["all"], options)
     with progress_bar() as progress:
-        outcomes = run_drives(planned, output, workers, scheduler, progress, threads)
+        outcomes = run_drives(planned, output, workers, scheduler, progress, threads, memory)
     summary_table(outcomes).print()
     failed = [outcome for outcome in outcomes if outcome.status == "failed"]
     kept = sum(outcome.status == "kept" for outcome in outcomes)

@@ -20,6 +20,7 @@ KINDS = ("living", "kitchen", "office", "bedroom", "bath", "office")
 DOOR_HEIGHT = 2.1
 _AISLE = 1.0  # left free between the furniture at the walls and the table in the middle, metres
 _DEEPEST = 0.65  # piece at a wall, metres
+_TOUCHES = 1e-6  # metres
 _STEP = 0.5  # between the vertices of walls, which carry the light, metres
 
 
@@ -37,12 +38,6 @@ class Room:
         x0, y0, x1, y1 = self.area
         return np.asarray(((points > (x0, y0)) & (points < (x1, y1))).all(axis=1))
 
-    def side(self, number: int) -> tuple[tuple[float, float], float, float]:
-        """Where a wall begins, counterclockwise, its direction as an angle, and its length."""
-        x0, y0, x1, y1 = self.area
-        corner = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))[number]
-        return corner, number * np.pi / 2.0, x1 - x0 if number % 2 == 0 else y1 - y0
-
 
 @dataclass(frozen=True)
 class House:
@@ -51,21 +46,14 @@ class House:
     rooms: list[Room]
     doors: list[Rectangle]
 
-    def openings(self, room: Room, number: int) -> list[tuple[float, float]]:
-        """Where the doors in a wall of a room begin and end along it, in order."""
-        x0, y0, x1, y1 = room.area
+    def openings(self, wall: Site, length: float) -> list[tuple[float, float]]:
+        """Where the doors in a wall begin and end along it, in order."""
         found = []
-        for left, low, right, high in self.doors:
-            spans = (
-                (left - x0, right - x0),
-                (low - y0, high - y0),
-                (x1 - right, x1 - left),
-                (y1 - high, y1 - low),
-            )
-            touches = (high == y0, left == x1, low == y1, right == x0)[number]
-            along = spans[number]
-            if touches and along[0] > 0.0 and along[1] < room.side(number)[2]:
-                found.append(along)
+        for door in self.doors:
+            corners = (np.reshape(door, (2, 2)) - wall.origin[:2]) @ wall.frame[:2, :2].T
+            (start, end), (_, inwards) = np.sort(corners, axis=0).T
+            if abs(inwards) < _TOUCHES and start > 0.0 and end < length:
+                found.append((start, end))
         return sorted(found)
 
 
@@ -176,9 +164,8 @@ class Interior:
 
     def _furnish(self, room: Room, number: int, wall: int) -> None:
         """One wall around its doors, seen from inside, with windows, furniture and pictures."""
-        rng, openings = self.rng, self.house.openings(room, number)
-        (x, y), angle, length = room.side(number)
-        foot = self.site.at(x, y, angle)
+        rng, (foot, length) = self.rng, self.site.side(room.area, number)
+        openings = self.house.openings(foot, length)
         for k, (start, end) in enumerate(pairwise([0.0, *np.ravel(openings), length])):
             low = DOOR_HEIGHT * (k % 2)
             corner = foot.moved(end, up=low).origin
@@ -208,7 +195,7 @@ class Interior:
 
     def _place(self, piece: Piece, place: Site, width: float) -> None:
         depth = piece(place, width)
-        corners = np.stack([place.origin, place.moved(width).moved(0.0, depth).origin])
+        corners = np.stack([place.origin, place.moved(width, depth).origin])
         self.obstacles.append((*corners.min(axis=0)[:2], *corners.max(axis=0)[:2]))
 
     def _hang(self, place: Site, width: float) -> None:
@@ -234,16 +221,15 @@ class Interior:
         if number not in room.outside:
             return []
         rng = self.rng
-        (x, y), angle, length = room.side(number)
+        place, length = self.site.side(room.area, number)
         low, high = (1.6, 1.6) if room.kind == "hall" else (0.95, 1.2)
         width = min(rng.uniform(1.0, 1.7), length - 0.4)
         spans, left = [], rng.uniform(0.2, 0.9)
-        place = self.site.at(x, y, angle)
         while left + width < length - 0.1:
             sky = np.array([0.86, 0.92, 0.98]) * rng.uniform(0.9, 1.05)
             pane = place.instance("pane", sky, self.skirting, (width, high, 1.0))
             place.plate((left, 0.0, low), (width, 0.01, high), pane, self.frame_look)
-            x_light, y_light, _ = place.moved(left + 0.5 * width).moved(0.0, 0.8).origin
+            x_light, y_light, _ = place.moved(left + 0.5 * width, 0.8).origin
             strength = (0.35 if room.kind == "hall" else 0.7) * width * high
             self._lights.append((x_light, y_light, low + 0.6 * high, strength))
             spans.append((left, left + width))
@@ -262,7 +248,7 @@ class Interior:
                 while left < high[0] - 1.0:
                     piece, width = STANDING["hall"][rng.integers(3)]
                     width = min(width, high[0] - left)
-                    self._place(piece, self.site.at(left, y), width)
+                    self._place(piece, self.site.moved(left, y), width)
                     left += width + rng.choice([0.05, 1.3], p=[0.6, 0.4])
             return
         if room.kind in ("living", "bedroom", "office") and free.min() > 0.2:
@@ -275,7 +261,7 @@ class Interior:
         if free[0] > 0.8 and free[1] > 1.2 and rng.random() < 0.8:
             width, depth = min(free[0], 1.8), min(free[1] - 0.6, 0.9)
             x, y = low + 0.5 * (free - np.array([width, depth]))
-            dining(self.site.at(x, y), width, depth)
+            dining(self.site.moved(x, y), width, depth)
             self.obstacles.append((x, y - 0.3, x + width, y + depth + 0.3))
 
     def _lamps(self, room: Room) -> None:
@@ -286,8 +272,8 @@ class Interior:
         across, along = (max(1, round(extent / 3.4)) for extent in (x1 - x0, y1 - y0))
         for x in x0 + (np.arange(across) + 0.5) / across * (x1 - x0):
             for y in y0 + (np.arange(along) + 0.5) / along * (y1 - y0):
-                lamp = self.site.at(x - 0.25, y - 0.15, z=room.height - 0.06)
-                lamp.solid((0, 0, 0.001), (0.5, 0.3, 0.05), bulb)
+                lamp = self.site.moved(x - 0.25, y - 0.15, room.height - 0.06)
+                lamp.box((0, 0, 0.001), (0.5, 0.3, 0.05), bulb)
                 self._lights.append((x, y, room.height - 0.3, strength))
 
 

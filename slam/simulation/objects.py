@@ -4,7 +4,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from slam.simulation.geometry import FloatArray
 from slam.simulation.shapes import UP, Site, lattice
 
 
@@ -21,18 +20,18 @@ def building(site: Site, width: float, depth: float) -> None:
     look = (floor, spacing, window_width, rng.uniform(1.1, 1.7), style, height)
     wall = site.instance("wall", plaster, trim, look)
     roof = site.instance("roof", "roof")
-    site.box(np.zeros(3), (width, depth, height), wall, roof)
+    site.box((0, 0, 0), (width, depth, height), wall, roof)
     if rng.random() < 0.65:
         _gable(site, (width, depth, height), wall, roof)
     if rng.random() < 0.4:  # a bay or porch in front
         w = rng.uniform(0.2, 0.4) * width
         x = rng.uniform(0.5, width - w - 0.5)
         top = rng.uniform(0.6, 1.0) * height if floors > 1 else 2.6
-        site.box((x, -0.9, 0.0), (x + w, 0.0, top), wall, roof)
+        site.box((x, -0.9, 0), (w, 0.9, top), wall, roof)
     if rng.random() < 0.5:  # a chimney
         x, y = rng.uniform(0.2, 0.8) * width, rng.uniform(0.3, 0.7) * depth
         stone = site.instance("wall", 0.8 * plaster, trim, (99.0, 99.0, 0.0, 0.0, 1.0, height))
-        site.box((x, y, height), (x + 0.8, y + 0.8, height + 3.0), stone)
+        site.box((x, y, height), (0.8, 0.8, 3.0), stone)
 
 
 def _gable(site: Site, size: tuple[float, float, float], wall: int, roof: int) -> None:
@@ -90,19 +89,19 @@ def hedge(site: Site, length: float) -> None:
         plain = (99.0, 99.0, 0.0, 0.0, 1.0, height)  # without windows
         look = site.instance("wall", "garden wall", 1.0, plain)
         thick = 0.3
-    site.box(np.zeros(3), (length, thick, height), look)
+    site.box((0, 0, 0), (length, thick, height), look)
 
 
-def lamp(site: Site, towards: FloatArray) -> None:
-    """A street lamp whose arm reaches ``towards`` the road, a plan direction ``(2,)``."""
+def lamp(site: Site) -> None:
+    """A street lamp whose arm reaches against the place's y axis."""
     steel = site.instance("metal", "street lamp")
     top = site.pole(site.rng.uniform(5.0, 8.0), (0.10, 0.06), steel)
-    reach = np.array([*towards, 0.12])
+    reach = 0.12 * UP - site.frame[1]
     site.tube(top, top + reach * site.rng.uniform(0.9, 1.8), (0.05, 0.09), steel)
 
 
 def sign(site: Site) -> None:
-    """A traffic sign on a post; its plate faces traffic that drives along the place's y axis."""
+    """A traffic sign on a post; its plate faces traffic that drives along the place's x axis."""
     steel = site.instance("metal", "sign post")
     height = site.rng.uniform(2.1, 2.7)
     site.pole(height + 0.3, (0.04, 0.04), steel)
@@ -110,7 +109,7 @@ def sign(site: Site) -> None:
     half = site.rng.uniform(0.3, 0.45)
     kind = float(site.rng.integers(3))
     plate = site.instance("sign", paint, (0.92, 0.92, 0.90), (half, kind))
-    site.moved(-half, -0.06, height).box(np.zeros(3), (2 * half, 0.02, 2 * half), plate)
+    site.box((-0.06, -half, height), (0.02, 2 * half, 2 * half), plate)
 
 
 def railing(site: Site, length: float) -> None:
@@ -149,11 +148,11 @@ def barrier(site: Site, length: float, concrete: bool) -> None:
     for along in np.arange(0.0, length - 3.9, 4.0).tolist():
         place = site.moved(along)
         if concrete:
-            place.box((0.0, -0.3, 0.0), (4.0, 0.3, 0.35), look)
-            place.box((0.0, -0.12, 0.35), (4.0, 0.12, 0.9), look)
+            place.box((0, -0.3, 0), (4.0, 0.6, 0.35), look)
+            place.box((0, -0.12, 0.35), (4.0, 0.24, 0.55), look)
         else:
             place.pole(0.75, (0.06, 0.06), look)
-            place.box((0.0, -0.05, 0.45), (4.0, 0.05, 0.76), look)
+            place.box((0, -0.05, 0.45), (4.0, 0.1, 0.31), look)
 
 
 def post(site: Site) -> None:
@@ -205,7 +204,7 @@ def car(site: Site) -> None:
     van = rng.random() < 0.2
     waist = rng.uniform(0.82, 0.98)
     roof = rng.uniform(1.38, 1.6) + (0.45 if van else 0.0)
-    site.box((-length / 2, -half, 0.25), (length / 2, half, waist), paint)
+    site.box((-length / 2, -half, 0.25), (length, 2 * half, waist - 0.25), paint)
     hood = rng.uniform(0.10, 0.16) if van else rng.uniform(0.2, 0.3)
     low = (-0.48 * length, (0.5 - hood) * length)
     high = (low[0] + (0.1 if van else rng.uniform(0.2, 0.8)), low[1] - rng.uniform(0.5, 0.8))

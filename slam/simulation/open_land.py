@@ -6,7 +6,7 @@ from slam.simulation import objects
 from slam.simulation.geometry import FloatArray
 from slam.simulation.options import StreetKind
 from slam.simulation.route import KERB
-from slam.simulation.shapes import Rectangle, Site, corners_of, directed, grid_over
+from slam.simulation.shapes import UP, Rectangle, Site, grid_over
 
 
 def open_land(
@@ -36,21 +36,19 @@ def open_land(
     land = grass if rng.random() < 0.4 else site.instance("grass", crop, 0.6)
     site.patch(points, points[..., :2], land)
     wood = rng.choice([0.0, 1.0, 4.0, 10.0])  # trees in 100 square metres near the road
-    corners = corners_of(inner)
-    for side in np.flatnonzero(sides):
-        start = corners[side]
-        length, ahead, inward, angle = directed(start, corners[(side + 1) % 4])
+    for number in np.flatnonzero(sides):
+        edge, length = site.side(inner, number)
         for _ in range(rng.poisson(0.15 * wood * length)):
             far = 15.0 * rng.random() ** 1.5
-            x, y = start + rng.uniform(0.0, length) * ahead + far * inward
-            z = float(ground(x, y))
+            spot = edge.moved(rng.uniform(0.0, length), far)
+            z = float(ground(*spot.origin[:2]))
             if rng.random() < 0.4:
                 bush = site.instance("leaves", "bush", 0.45)
                 size = rng.uniform(0.5, 1.8)
-                site.ball(np.array([x, y, z + 0.4 * size]), (size, size, 0.8 * size), bush)
+                site.ball(spot.origin + (z + 0.4 * size) * UP, (size, size, 0.8 * size), bush)
             elif far > 1.5:
-                objects.tree(site.at(x, y, z=z - 0.2), rng.uniform(4.0, 13.0))
-        _edge(site.at(start[0], start[1], angle, KERB), kind, length)
+                objects.tree(spot.moved(0.0, up=z - 0.2), rng.uniform(4.0, 13.0))
+        _edge(edge.moved(0.0, up=KERB), kind, length)
 
 
 def _edge(site: Site, kind: StreetKind, length: float) -> None:
@@ -61,14 +59,13 @@ def _edge(site: Site, kind: StreetKind, length: float) -> None:
             objects.barrier(site, length, luck < 0.25)
         elif luck < 0.87:  # against the noise
             wall = site.instance("boards", "noise wall", 0.6, (0.5,))
-            site.box(np.zeros(3), (length, 0.3, site.rng.uniform(2.5, 5.0)), wall)
+            site.box((0, 0, 0), (length, 0.3, site.rng.uniform(2.5, 5.0)), wall)
     elif luck < 0.3:
         objects.wire_fence(site, length)
     elif luck < 0.4:
         objects.hedge(site, length)
     elif luck < 0.6:
         for along in np.arange(3.0, length, site.rng.uniform(7.0, 14.0)).tolist():
-            x, y, _ = site.moved(along).moved(0.0, 0.5).origin
-            objects.tree(site.at(x, y), site.rng.uniform(6.0, 12.0))
+            objects.tree(site.moved(along, 0.5, -KERB), site.rng.uniform(6.0, 12.0))
     elif luck < 0.75:
         objects.barrier(site, length, False)

@@ -1,5 +1,6 @@
 """Objects of a street: buildings, trees, hedges, fences, lamps, signs, cars and people."""
 
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -112,47 +113,60 @@ def sign(site: Site) -> None:
     site.box((-0.06, -half, height), (0.02, 2 * half, 2 * half), plate)
 
 
-def railing(site: Site, length: float) -> None:
-    """Posts and bars along the place's x axis, which one sees through."""
+def fence(site: Site, length: float) -> None:
+    """A railing, or posts and wires, along the place's x axis, which one sees through."""
     rng = site.rng
-    steel = site.instance("metal", "railing")
-    height, spacing = rng.uniform(0.6, 1.3), rng.choice([0.15, 0.3, 1.5, 2.5])
-    radii = (rng.uniform(0.015, 0.05),) * 2
-    posts = np.arange(0.0, length, max(spacing, length / 120))
-    for along in posts.tolist():
-        site.moved(along).pole(height, radii, steel)
-    for level in np.linspace(1.0, 0.25, rng.integers(1, 4)):
-        bar = site.origin + level * height * UP
-        site.tube(bar, bar + posts[-1] * site.frame[0] + 1e-3 * site.frame[0], radii, steel)
-
-
-def wire_fence(site: Site, length: float) -> None:
-    """Wooden posts and the wires between them along the place's x axis."""
-    rng = site.rng
-    wood = site.instance("bark", "fence post")
-    wire = site.instance("metal", "wire")
-    height = rng.uniform(0.9, 1.4)
-    posts = np.arange(0.0, length, rng.uniform(2.0, 4.0)).tolist()
-    for along in posts:
-        foot = site.moved(along).origin
-        site.tube(foot - 0.2 * UP, foot + height * UP, (0.05, 0.045), wood)
-    for level in np.linspace(0.95, 0.3, rng.integers(2, 5)):
-        up = site.moved(0.0, up=level * height)
-        for here, there in pairwise(posts):
-            site.tube(up.moved(here).origin, up.moved(there).origin, (0.008, 0.008), wire)
+    steel = site.instance("metal", "fence bars")
+    height, spacing = rng.uniform(0.6, 1.4), rng.choice([0.15, 0.3, 1.5, 2.5])
+    _rails(
+        site,
+        length,
+        max(spacing, length / 120),
+        height,
+        rng.uniform((0.015, 0.008), 0.05),
+        np.linspace(1.0, 0.25, rng.integers(1, 5)),
+        steel,
+    )
 
 
 def barrier(site: Site, length: float, concrete: bool) -> None:
-    """A wall of concrete, or a steel rail on posts, along the place's x axis in pieces of 4 m."""
+    """A wall of concrete, or a steel rail on posts, along the place's x axis."""
     look = site.instance("gravel" if concrete else "metal", "barrier", 0.8)
-    for along in np.arange(0.0, length - 3.9, 4.0).tolist():
-        place = site.moved(along)
-        if concrete:
-            place.box((0, -0.3, 0), (4.0, 0.6, 0.35), look)
-            place.box((0, -0.12, 0.35), (4.0, 0.24, 0.55), look)
-        else:
-            place.pole(0.75, (0.06, 0.06), look)
-            place.box((0, -0.05, 0.45), (4.0, 0.1, 0.31), look)
+    if concrete:
+        for along in np.arange(0.0, length - 3.9, 4.0).tolist():
+            site.moved(along).box((0, -0.15, 0), (4.0, 0.3, 0.9), look)
+    else:
+        _rails(site, length, 4.0, 0.75, (0.06, 0.15), [0.8], look)
+
+
+def _rails(
+    site: Site,
+    length: float,
+    spacing: float,
+    height: float,
+    radii: Sequence[float],
+    levels: Iterable[float],
+    look: int,
+) -> None:
+    """Posts, and at some shares of their height bars, in pieces of about 4 m as the road bends.
+
+    Args:
+        site: where they begin.
+        length: along its x axis.
+        spacing: of posts.
+        height: of posts.
+        radii: of a post and of a bar.
+        levels: of the bars.
+        look: of all.
+    """
+    post, bar = radii
+    for along in np.arange(0.0, length, spacing).tolist():
+        site.moved(along).pole(height, (post, post), look)
+    joints = np.linspace(0.0, length, int(length / 4.0) + 2).tolist()
+    for level in levels:
+        ends = [site.moved(along, up=level * height).origin for along in joints]
+        for here, there in pairwise(ends):
+            site.tube(here, there, (bar, bar), look)
 
 
 def post(site: Site) -> None:

@@ -61,7 +61,7 @@ def _edge(site: Site, kind: StreetKind, length: float) -> None:
             wall = site.instance("boards", "noise wall", 0.6, (0.5,))
             site.box((0, 0, 0), (length, 0.3, site.rng.uniform(2.5, 5.0)), wall)
     elif luck < 0.3:
-        objects.wire_fence(site, length)
+        objects.fence(site, length)
     elif luck < 0.4:
         objects.hedge(site, length)
     elif luck < 0.6:

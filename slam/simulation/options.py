@@ -8,7 +8,7 @@ import numpy as np
 from slam.frames import Intrinsics
 from slam.runtime.errors import SequenceError
 
-VERSION = 2  # of the worlds: the same options give the same bytes within a version
+VERSION = 3  # of the worlds: the same options give the same bytes within a version
 MOST_FRAMES = 100_000
 STREET_RATE = 10.0
 _MOST_PIXELS = 2**25
@@ -30,7 +30,7 @@ class SimulationOptions:
     """The street or the rooms to simulate; ``seed`` determines everything else.
 
     A ``varied`` street is a town's, an avenue, a country road or a motorway (`Variety`) with
-    another camera than KITTI's, hills, hard light, railings and people, and cars that overtake if
+    another camera than KITTI's, hills, hard light, fences and people, and cars that overtake if
     any move; ``varied`` rooms have another focal length. ``rate``, frames a second, and ``motion``
     are of rooms. ``fov_deg`` is the horizontal field of view of square pixels; None is that of the
     world's own camera.

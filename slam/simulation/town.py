@@ -20,7 +20,7 @@ def build_town(plan: StreetPlan, bend: Bend, seed: int, varied: bool = False) ->
         plan: the streets.
         bend: from the plan to street coordinates.
         seed: of the world.
-        varied: whether there are railings, posts and people as well.
+        varied: whether there are fences, posts and people as well.
     """
     rng = luck(seed, 10)
     town = _Town(plan, rng, luck(seed, 11) if varied else None)
@@ -185,11 +185,11 @@ class _Town:
             along += rng.uniform(5.4, 7.5)
         if self.more is None:
             return
-        # a railing along a part of the kerb, thin posts, and people on the pavement
+        # a fence along a part of the kerb, thin posts, and people on the pavement
         rng, kerb = self.more, kerb.drawn_by(self.more)
         if rng.random() < 0.45 and length > 16.0:
             first, last = np.sort(rng.uniform(6.0, length - 6.0, 2))
-            objects.railing(kerb.moved(first, rng.uniform(0.2, 0.8), KERB), last - first)
+            objects.fence(kerb.moved(first, rng.uniform(0.2, 0.8), KERB), last - first)
         for _ in range(rng.poisson(length / 14.0)):
             spot = kerb.moved(rng.uniform(5.0, max(length - 5.0, 6.0)), rng.uniform(-0.8, 1.6))
             (objects.person if rng.random() < 0.6 else objects.post)(spot)

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d, map_coordinates
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial.transform import Rotation
 
 from slam.geometry import se3
 from slam.simulation.geometry import FloatArray, IntArray
@@ -27,6 +28,9 @@ FASTEST_TURN_DEG = 17.0  # a frame
 _STRIDE_M = 0.72
 _SETTLED_S = 0.15  # over which turns and starts are smoothed
 _CARRIER_CLEAR_M = 0.4  # of the carrier in the plan, where nothing is swayed any further
+
+# its carrier looks along x, with y to the left and z up
+R_CARRIER_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 class Floor:
@@ -159,8 +163,8 @@ GAITS: dict[str, Gait] = {
 class Carried:
     """A motion, ``CLOCK`` samples a second.
 
-    Its channels ``(M, 6)`` are x, y, z in metres, yaw to the left from east, pitch upwards and roll
-    in radians.
+    Its channels ``(M, 6)`` are x, y, z in metres, yaw to the left from east, pitch downwards and
+    roll in radians.
     """
 
     def __init__(self, floor: Floor, motion: str, seconds: float, rate: float, seed: int) -> None:
@@ -204,27 +208,19 @@ class Carried:
             + tremors[2]
         )
         self._channels = np.stack(
-            [x + side * np.sin(yaw), y - side * np.cos(yaw), z, yaw, pitch, roll], axis=1
+            [x + side * np.sin(yaw), y - side * np.cos(yaw), z, yaw, -pitch, roll], axis=1
         )
 
     def at(self, seconds: FloatArray) -> FloatArray:
-        """The channels at times ``(N,)``, ``(6, N)``."""
+        """The channels at times ``(N,)``, ``(N, 6)``; its ends are held."""
         clock = np.arange(len(self._channels)) / CLOCK
-        return np.stack([np.interp(seconds, clock, channel) for channel in self._channels.T])
+        return se3.interpolated(seconds, clock, self._channels)
 
     def poses(self, seconds: FloatArray) -> FloatArray:
         """``T_scene_camera`` at times ``(N,)``, ``(N, 4, 4)``."""
-        x, y, z, yaw, pitch, roll = self.at(seconds)
-        level, zero = np.cos(pitch), np.zeros_like(x)
-        forward = np.stack([np.cos(yaw) * level, np.sin(yaw) * level, np.sin(pitch)], axis=1)
-        right = np.stack([np.sin(yaw), -np.cos(yaw), zero], axis=1)
-        upright = se3.make(
-            np.stack([right, np.cross(forward, right), forward], axis=2),
-            np.stack([x, y, z], axis=1),
-        )
-        return upright @ se3.from_rotation_vector(
-            np.stack([zero, zero, roll], axis=1), np.zeros((len(x), 3))
-        )
+        channels = self.at(seconds)
+        R_scene_carrier = Rotation.from_euler("ZYX", channels[:, 3:]).as_matrix()
+        return se3.make(R_scene_carrier @ R_CARRIER_CAMERA, channels[:, :3])
 
 
 def _unrest(rng: np.random.Generator, count: int, seconds: float) -> FloatArray:

@@ -14,9 +14,8 @@ from slam.simulation.irradiance import irradiance_of
 from slam.simulation.objects import person
 from slam.simulation.options import SimulationOptions
 from slam.simulation.room_textures import GLOWING
-from slam.simulation.shapes import Moving
+from slam.simulation.shapes import things
 from slam.simulation.world import (
-    SHUTTER,
     Hits,
     SimulatedWorld,
     Surface,
@@ -33,6 +32,7 @@ _AHEAD_S = 3.5  # by this time
 _NEAREST_M = 0.7  # of a person to the camera, below which the person is left out
 _GREY = 0.4  # brightness that exposure aims at
 _LONGEST_S = 0.02  # exposure in the light
+_MOST_OPEN = 0.9  # of the time between frames, of the shutter
 _METER_S = 0.1  # the meter's period
 _METERED = 12  # how often it is read
 _METER_WEIGHTS = np.exp(-_METER_S * np.arange(_METERED) / 0.35)  # the newest reading first
@@ -63,13 +63,13 @@ class SimulatedRooms(SimulatedWorld):
         ]
         rng = luck(options.seed, 57)
         # around their own origins, looking along x
-        self._people = Moving(rng, [person] * _PEOPLE) if peopled else None
+        self._people = things(rng, [person] * _PEOPLE) if peopled else []
         fov = options.fov_deg or _USUAL_FOV_DEG
         if options.varied and options.fov_deg is None:
             fov = float(np.exp(luck(options.seed, 55).uniform(*np.log(_VARIED_FOV_DEG))))
-        moments = self._moments(np.arange(options.frames) / options.rate)
+        seconds_of_frames = np.arange(options.frames) / options.rate
         camera = square_camera(options.width, options.height, fov)
-        super().__init__(options, camera, self._carried.poses(moments))
+        super().__init__(options, camera, self._poses(seconds_of_frames))
 
     def _build(self) -> Mesh:
         return self._interior.mesh
@@ -78,44 +78,31 @@ class SimulatedRooms(SimulatedWorld):
     def _irradiance(self) -> Float32Array:
         return irradiance_of(self.options.seed, "exposure" in self.options.hazards)
 
-    def _moments(self, seconds: FloatArray) -> FloatArray:
-        """Where in the motion the camera is at times ``(N,)``: it may be put down halfway."""
-        if "stop" not in self.options.hazards:
-            return seconds
-        middle = 0.5 * max(len(self) / self.options.rate - STILL_S, 0.0)
-        return seconds - np.clip(seconds - middle, 0.0, STILL_S)
+    def _poses(self, seconds: FloatArray) -> FloatArray:
+        if "stop" in self.options.hazards:  # the camera is put down halfway
+            middle = 0.5 * max(len(self) / self.options.rate - STILL_S, 0.0)
+            seconds = seconds - np.clip(seconds - middle, 0.0, STILL_S)
+        return self._carried.poses(seconds)
 
-    def _exposures(self, index: int) -> FloatArray:
-        options = self.options
-        offsets = np.zeros((1, 1))
-        if "blur" in options.hazards:
-            forward = self._T_scene_camera[max(index - 1, 0) : index + 2, :3, 2]
-            turned = np.linalg.norm(np.diff(forward, axis=0), axis=1).max()
-            longest_s = 2.0 * SHUTTER * 0.9 / options.rate
-            open_s = min(_LONGEST_S * self._gain(index) / self._usual_gain, longest_s)
-            blurred_px = turned * open_s * options.rate * self.camera.fx
-            samples = int(np.clip(blurred_px / 4.0, 3, 12))
-            offsets = offsets + open_s * ((np.arange(samples)[:, None] + 0.5) / samples - 0.5)
-        if options.readout_s:
-            rows = (np.arange(options.height) + 0.5) / options.height - 0.5
-            offsets = offsets + options.readout_s * rows
-        moments = self._moments(index / options.rate + offsets.ravel())
-        poses = self._carried.poses(np.maximum(moments, 0.0)).reshape(*offsets.shape, 4, 4)
-        return poses[:, 0] if offsets.shape[1] == 1 else poses
+    def _shutter(self, index: int) -> tuple[float, int]:
+        forward = self._T_scene_camera[max(index - 1, 0) : index + 2, :3, 2]
+        turned = np.linalg.norm(np.diff(forward, axis=0), axis=1).max()
+        rate = self.options.rate
+        open_s = min(_LONGEST_S * self._gain(index) / self._usual_gain, _MOST_OPEN / rate)
+        blurred_px = turned * open_s * rate * self.camera.fx
+        return open_s, int(np.clip(blurred_px / 4.0, 3, 12))
 
     def _moving(self, index: int) -> list[Mesh]:
-        if self._people is None:
-            return []
         now = index / self.options.rate
         # the first walks where the camera will be
         walkers = [(self._carried, now + _AHEAD_S), *((walk, now) for walk in self._walks)]
         camera = self._T_scene_camera[index, :2, 3]
-        seen = {}
-        for number, (walk, seconds) in enumerate(walkers):
+        seen = []
+        for mesh, (walk, seconds) in zip(self._people, walkers):
             T_scene_person = _standing(walk, seconds)
             if np.linalg.norm(T_scene_person[:2, 3] - camera) > _NEAREST_M:
-                seen[number] = T_scene_person
-        return self._people.placed(seen)
+                seen.append(mesh.placed(T_scene_person))
+        return seen
 
     def _shade(self, hits: Hits, surfaces: list[Surface]) -> Float32Array:
         rgb = hits.unlit(self.camera.fx)
@@ -169,9 +156,9 @@ class SimulatedRooms(SimulatedWorld):
     @functools.lru_cache(maxsize=256)  # noqa: B019 - readings are small, worlds are kept for long
     def _brightness(self, tick: int) -> float:
         """Mean of a coarse image without textures, as the camera's meter sees it."""
-        moment = self._moments(np.array([tick * _METER_S]))
+        (pose,) = self._poses(np.array([tick * _METER_S]))
         few = self._rays[:: max(len(self._rays) // 400, 1)]
-        answer = self._still.cast(place_rays(self._carried.poses(moment)[0], few))
+        answer = self._still.cast(place_rays(pose, few))
         met = np.isfinite(answer["t_hit"])
         triangle = answer["primitive_ids"][met].astype(np.int64)
         light = self._light(triangle, answer["primitive_uvs"][met].T)
@@ -181,6 +168,5 @@ class SimulatedRooms(SimulatedWorld):
 
 def _standing(walk: Carried, seconds: float) -> FloatArray:
     """``T_scene_person`` of whoever walks so, upright on the floor."""
-    x, y, _, yaw, _, _ = walk.at(np.array([seconds]))[:, 0]
-    c, s = np.cos(yaw), np.sin(yaw)
-    return se3.make(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.array([x, y, -0.1]))
+    ((x, y, _, yaw, _, _),) = walk.at(np.array([seconds]))
+    return se3.from_rotation_vector(np.array([0.0, 0.0, yaw]), np.array([x, y, -0.1]))

@@ -1,7 +1,6 @@
 """Where surfaces are built: simple bodies and their looks, and level rectangles of a plan."""
 
 import copy
-import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from operator import itemgetter
@@ -29,8 +28,6 @@ from slam.simulation.geometry import (
 Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1
 
 UP = np.array([0.0, 0.0, 1.0])
-# fields of a mesh whose last axis is that of its triangles
-_OF_TRIANGLES = ("uv", "normals", "tangents", "instance", "material")
 
 
 @functools.cache
@@ -247,40 +244,15 @@ def _last(table: FloatArray) -> Float32Array:
     return np.ascontiguousarray(np.moveaxis(table, 0, -1), dtype=np.float32)
 
 
-class Moving:
-    """Meshes around their own origins, to be placed anew at every frame."""
-
-    def __init__(self, rng: np.random.Generator, makers: Sequence[Callable[[Site], None]]) -> None:
-        """Things that are made one after another at one site."""
-        site, after = Site(rng), []
-        for make in makers:
-            make(site)
-            after.append(len(site.looks))
-        self._mesh = site.finish(FLAT)
-        self._thing_of_triangle = np.searchsorted(after, self._mesh.instance, side="right")
-
-    def placed(self, T_scene_things: dict[int, FloatArray]) -> list[Mesh]:
-        """One mesh of the things of these numbers at their poses ``(4, 4)``; none of no things."""
-        if not T_scene_things:
-            return []
-        parts = [
-            self._part(number, T_scene_thing) for number, T_scene_thing in T_scene_things.items()
-        ]
-        corners = np.concatenate([part.vertices for part in parts])
-        corners_of = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
-        tables = {}
-        for name in _OF_TRIANGLES:
-            tables[name] = np.concatenate([getattr(part, name) for part in parts], axis=-1)
-        return [dataclasses.replace(self._mesh, vertices=corners, triangles=corners_of, **tables)]
-
-    def _part(self, number: int, T_scene_thing: FloatArray) -> Mesh:
-        """The triangles of one thing, three vertices each, moved into the scene."""
-        mine = self._thing_of_triangle == number
-        R, t = T_scene_thing[:3, :3].astype(np.float32), T_scene_thing[:3, 3].astype(np.float32)
-        tables = {name: getattr(self._mesh, name)[..., mine] for name in _OF_TRIANGLES}
-        tables |= {name: R @ tables[name] for name in ("normals", "tangents")}
-        vertices = self._mesh.vertices[self._mesh.triangles[mine].ravel()] @ R.T + t
-        return dataclasses.replace(self._mesh, vertices=vertices, **tables)
+def things(rng: np.random.Generator, makers: Sequence[Callable[[Site], None]]) -> list[Mesh]:
+    """What each maker makes around its own origin, one after another at one site."""
+    site, after = Site(rng), []
+    for make in makers:
+        make(site)
+        after.append(len(site.looks))
+    mesh = site.finish(FLAT)
+    thing_of_triangle = np.searchsorted(after, mesh.instance, side="right")
+    return [mesh.part(thing_of_triangle == number) for number in range(len(makers))]
 
 
 def lattice(u: ArrayLike, v: ArrayLike) -> FloatArray:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
 from slam.geometry import se3
@@ -17,11 +16,10 @@ from slam.simulation.geometry import Float32Array, FloatArray, Mesh, luck
 from slam.simulation.objects import bonnet, car
 from slam.simulation.options import SimulationOptions, draw_variety
 from slam.simulation.route import STEP, Route, plan_route
-from slam.simulation.shapes import Moving
+from slam.simulation.shapes import things
 from slam.simulation.texture import Axis, Texels
 from slam.simulation.town import build_town
 from slam.simulation.world import (
-    SHUTTER,
     Hits,
     SimulatedWorld,
     Surface,
@@ -34,6 +32,7 @@ from slam.simulation.world import (
 KITTI_CAMERA = Intrinsics(1241, 376, 718.856, 718.856, 607.1928, 185.2157)
 STILL_FRAMES = 30  # of a stop: 3 s at 10 frames a second
 BLUR_SAMPLES = 6
+SHUTTER = 0.5  # exposure time of a blurred image over the frame interval
 WIDEST_LANE_M = 2.0  # from its middle to its edge
 _DARKEST_MEAN = 0.33  # of an image, to which a camera exposes at least
 
@@ -120,19 +119,18 @@ class SimulatedStreet(SimulatedWorld):
 
     def _moving(self, index: int) -> list[Mesh]:
         cars = self._traffic.placed(index) if self._traffic else []
-        bonnet = self._bonnet.placed({0: self._T_scene_camera[index]}) if self._bonnet else []
-        return cars + bonnet
+        return cars + [each.placed(self._T_scene_camera[index]) for each in self._bonnet]
 
     @functools.cached_property
-    def _bonnet(self) -> Moving | None:
+    def _bonnet(self) -> list[Mesh]:
         """The bonnet of the own car; none under motion blur, which would smear it."""
         if self._variety is None or self._variety.bonnet == 0.0 or "blur" in self.options.hazards:
-            return None
+            return []
         rng = luck(self.options.seed, 12)
         below = (
             self.options.height * (1.0 - self._variety.bonnet) - self.camera.cy
         ) / self.camera.fy
-        return Moving(rng, [lambda site: bonnet(site, below, self.camera_height_m)])
+        return things(rng, [lambda site: bonnet(site, below, self.camera_height_m)])
 
     @functools.cached_property
     def _gain(self) -> float:
@@ -144,21 +142,12 @@ class SimulatedStreet(SimulatedWorld):
         brightest = float(np.quantile(np.max(views, axis=-1), 1.0 - self._weather.saturated))
         return max(1.0 / brightest, _DARKEST_MEAN / float(np.mean(np.minimum(views, brightest))))
 
-    def _exposures(self, index: int) -> FloatArray:
-        T_street_camera = self._T_scene_camera
-        here = T_street_camera[index]
-        # poses while the shutter is open around a frame; all one pose at a stop
-        low, high = max(index - 1, 0), min(index + 1, len(self) - 1)
-        if "blur" not in self.options.hazards:
-            return here[None]
-        T_low_high = se3.invert(T_street_camera[low]) @ T_street_camera[high]
-        turn = Rotation.from_matrix(T_low_high[:3, :3]).as_rotvec()
-        fraction = ((np.arange(BLUR_SAMPLES) + 0.5) / BLUR_SAMPLES - 0.5)[:, None]
-        if np.array_equal(here, T_street_camera[high]):
-            fraction *= 0.0
-        fraction *= SHUTTER / (high - low)
-        motion = fraction * turn, fraction * T_low_high[:3, 3]
-        return np.asarray(here @ se3.from_rotation_vector(*motion))
+    def _poses(self, seconds: FloatArray) -> FloatArray:
+        frames = np.arange(len(self), dtype=np.float64)
+        return se3.interpolate(self._T_scene_camera, frames, seconds * self.options.rate)
+
+    def _shutter(self, index: int) -> tuple[float, int]:
+        return SHUTTER / self.options.rate, BLUR_SAMPLES
 
     def _background(self, directions: Float32Array) -> Float32Array:
         weather, up = self._weather, np.clip(directions[2], 0.0, 1.0)
@@ -335,7 +324,7 @@ class Traffic:
             self._plan_passing(luck(seed, 34))
         self._gap = rng.uniform(9.0, 14.0) / STEP
         self._leader_leaves = rng.uniform(0.4, 0.8) * len(drive.sample)
-        self._cars = Moving(rng, [car] * (1 + len(self._courses)))
+        self._cars = things(rng, [car] * (1 + len(self._courses)))
 
     def _plan_passing(self, rng: np.random.Generator) -> None:
         """Courses of cars on the camera's left, and of slower ones on its right."""
@@ -354,17 +343,16 @@ class Traffic:
         # the one in the camera's lane keeps its distance, until it drives away
         faster = max(0.0, index - self._leader_leaves) * 0.5 / STEP
         leader = self._route.sample[index] + self._gap + faster
-        seen = {}
-        for number, (start, speed, left_m, way) in enumerate(
-            [(leader, 0.0, 0.0, 1.0), *self._courses]
-        ):
+        seen = []
+        courses = [(leader, 0.0, 0.0, 1.0), *self._courses]
+        for mesh, (start, speed, left_m, way) in zip(self._cars, courses, strict=True):
             T_street_car = self._at(start + speed * index, left_m, way)
             # nearer only where the drive crosses itself
             if T_street_car is not None and (
                 2.6 < np.linalg.norm(T_street_car[:3, 3] - camera) < 120.0
             ):
-                seen[number] = T_street_car
-        return self._cars.placed(seen)
+                seen.append(mesh.placed(T_street_car))
+        return seen
 
     def _at(self, sample: float, left_m: float, sense: float) -> FloatArray | None:
         """``T_street_car`` at a lane sample, beside the lane; None beyond its ends."""

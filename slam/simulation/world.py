@@ -24,7 +24,6 @@ from slam.simulation.texture import Axis, Texels
 
 FARTHEST_M = 200.0  # surfaces beyond are treated as sky
 SHADERS = STREET_SHADERS | ROOM_SHADERS
-SHUTTER = 0.5  # exposure time of a blurred image over the frame interval
 
 
 class Surface:
@@ -158,11 +157,12 @@ class SimulatedWorld(ABC):
         """Colour of hits, RGB about [0, 1], ``(3, N)``; the surfaces are all of the frame."""
 
     @abstractmethod
-    def _exposures(self, index: int) -> FloatArray:
-        """Poses from which the image is taken, which is their mean.
+    def _poses(self, seconds: FloatArray) -> FloatArray:
+        """``T_scene_camera`` at times ``(N,)`` of the drive, ``(N, 4, 4)``; its ends are held."""
 
-        They are ``(S, 4, 4)``, or ``(S, H, 4, 4)`` with one a row.
-        """
+    @abstractmethod
+    def _shutter(self, index: int) -> tuple[float, int]:
+        """How long the shutter is open for a blurred frame, seconds, and of how many images."""
 
     @abstractmethod
     def _develop(self, rgb: Float32Array, index: int) -> Float32Array:
@@ -180,6 +180,18 @@ class SimulatedWorld(ABC):
         rgb = views[0] if len(views) == 1 else np.mean(views, axis=0)
         levels = self._develop(rgb, index) * np.float32(255.0) + np.float32(0.5)
         return np.clip(levels, 0.0, 255.0).astype(np.uint8)
+
+    def _exposures(self, index: int) -> FloatArray:
+        """Poses ``(S, R, 4, 4)`` of the images whose mean a frame is, one a row or one for all."""
+        offsets, options = np.zeros((1, 1)), self.options
+        if "blur" in options.hazards:
+            open_s, samples = self._shutter(index)
+            offsets = open_s * ((np.arange(samples)[:, None] + 0.5) / samples - 0.5)
+        if options.readout_s:
+            rows = (np.arange(options.height) + 0.5) / options.height - 0.5
+            offsets = offsets + options.readout_s * rows
+        poses = self._poses(index / options.rate + offsets.ravel())
+        return poses.reshape(*offsets.shape, 4, 4)
 
     def depth(self, index: int) -> Float32Array:
         """The z-depth of one frame in metres, 0 where nothing was hit, ``(H, W)``."""

@@ -199,22 +199,15 @@ class Interior:
         self.obstacles.append((*corners.min(axis=0)[:2], *corners.max(axis=0)[:2]))
 
     def _hang(self, place: Site, width: float) -> None:
-        """A picture, a poster, a mirror or a screen at the height of the eyes."""
+        """A picture or a mirror at the height of the eyes."""
         rng = self.rng
-        across, high = rng.uniform(0.4, min(width, 1.2)), rng.uniform(0.4, 0.8)
-        first, second = place.colour("paint"), place.colour("cloth")
-        kind = rng.random()
-        if kind < 0.75:
-            size = across, high, float(rng.integers(3))
-            look = place.instance("picture", first, second, size)
-        elif kind < 0.9:
-            look = place.instance("screen", first, second, (across, high))
+        size = rng.uniform(0.4, min(width, 1.2)), rng.uniform(0.4, 0.8)
+        if rng.random() < 0.8:
+            look = place.instance("picture", "paint", "cloth", size)
         else:
-            mirror = (0.72, 0.76, 0.78)
-            look = place.instance("pane", mirror, self.skirting, (across, high))
-        left = rng.uniform(0.0, width - across)
-        low = (left, 0.0, 1.6 - 0.5 * high + rng.uniform(-0.1, 0.15))
-        place.plate(low, (across, 0.02, high), look, self.frame_look)
+            look = place.instance("pane", (0.72, 0.76, 0.78), self.skirting, size)
+        low = (rng.uniform(0.0, width - size[0]), 0.0, rng.uniform(1.5, 1.75) - 0.5 * size[1])
+        place.plate(low, (size[0], 0.02, size[1]), look, self.frame_look)
 
     def _windows(self, room: Room, number: int) -> list[tuple[float, float]]:
         """Panes in an outside wall, which light the room; where they begin and end along it."""

@@ -46,34 +46,31 @@ class Floor:
         house = interior.house
         areas = np.array([room.area for room in house.rooms])
         self._origin = areas[:, :2].min(axis=0) - 0.5
-        shape = np.ceil((areas[:, 2:].max(axis=0) + 0.5 - self._origin) / CELL).astype(int)
-        free = np.zeros((shape[1], shape[0]), dtype=np.uint8)
-        for rectangles, value in (([*map(tuple, areas), *house.doors], 1), (interior.obstacles, 0)):
-            for x0, y0, x1, y1 in rectangles:
-                low, high = (
-                    (np.array(corner) - self._origin) / CELL for corner in ((x0, y0), (x1, y1))
-                )
-                outwards = 0.0 if value else 1.0
-                first = np.ceil(low - 0.5 - 0.5 * outwards).astype(int)
-                last = np.floor(high + 0.5 + 0.5 * outwards).astype(int)
-                free[first[1] : last[1], first[0] : last[0]] = value
+        columns, rows = np.ceil((areas[:, 2:].max(axis=0) + 0.5 - self._origin) / CELL).astype(int)
+        free = np.zeros((rows, columns), dtype=np.uint8)
+        for rectangles, value in (([*areas, *house.doors], 1), (interior.obstacles, 0)):
+            for rectangle in rectangles:
+                corners = (np.reshape(rectangle, (2, 2)) - self._origin) / CELL
+                (left, low), (right, high) = np.rint(corners).astype(int)
+                free[low:high, left:right] = value
         self._clearance = np.asarray(
             cv2.distanceTransform(free, cv2.DIST_L2, 5) * CELL, dtype=np.float64
         )
-        self._cells = np.argwhere(self._clearance >= _CLEAR_M)[:, ::-1]  # (C, 2), column and row
+        # of each cell of the floor, (C, 2)
+        self._centres = self._origin + CELL * (0.5 + np.argwhere(free >= 0)[:, ::-1])
         self._graph = self._connect()
         rng = np.random.default_rng([seed, 52])
         _, part = connected_components(self._graph, directed=False)
-        centres = self._centres(self._cells)
-        roomy = (part == np.bincount(part).argmax()) & (self.clearance(centres) >= _PLACE_CLEAR_M)
+        roomy = self._clearance.ravel() >= _PLACE_CLEAR_M
+        roomy &= part == np.bincount(part).argmax()
         chosen: list[int] = []
         rooms: list[int] = []
         for number, room in enumerate(house.rooms):  # up to five places a room
-            inside = np.flatnonzero(roomy & room.contains(centres))
+            inside = np.flatnonzero(roomy & room.contains(self._centres))
             found = rng.choice(inside, min(len(inside), 5), replace=False)
             chosen.extend(found)
             rooms.extend([number] * len(found))
-        self.places = centres[chosen]
+        self.places = self._centres[chosen]
         self.room = np.array(rooms)
         self._at = np.array(chosen)
 
@@ -85,11 +82,10 @@ class Floor:
     def path(self, start: int, end: int) -> FloatArray:
         """A walk between two places, a point every ``CELL`` or so, ``(M, 2)``."""
         _, before = self._from(start)
-        cells, at = [self._at[end]], int(self._at[end])
-        while at != self._at[start]:
-            at = int(before[at])
-            cells.append(at)
-        walk = self._centres(self._cells[cells[::-1]])
+        cells = [self._at[end]]
+        while cells[-1] != self._at[start]:
+            cells.append(before[cells[-1]])
+        walk = self._centres[cells[::-1]]
         for corner_m in _CORNERS_M:
             rounded = gaussian_filter1d(walk, corner_m / CELL, axis=0, mode="nearest")
             rounded[[0, -1]] = walk[[0, -1]]
@@ -101,25 +97,20 @@ class Floor:
         """How far every place is from one of them, ``(P,)``."""
         return self._from(start)[0][self._at]
 
-    def _centres(self, cells: IntArray) -> FloatArray:
-        return self._origin + (cells + 0.5) * CELL
-
     def _connect(self) -> coo_array:
         """Neighbouring cells, farther apart the nearer they are to walls."""
-        number = np.full(self._clearance.shape, -1)
-        number[self._cells[:, 1], self._cells[:, 0]] = np.arange(len(self._cells))
+        number = np.arange(self._clearance.size).reshape(self._clearance.shape)
+        is_clear = self._clearance >= _CLEAR_M
+        length = CELL * (1.0 + 0.15 / np.maximum(self._clearance, CELL) ** 2)
         starts, ends, lengths = [], [], []
-        for step in ((1, 0), (0, 1), (1, 1), (1, -1)):
-            there = self._cells + step
-            inside = (there >= 0).all(axis=1) & (there < number.T.shape).all(axis=1)
-            other = np.where(inside, number[there[:, 1] * inside, there[:, 0] * inside], -1)
-            here = np.flatnonzero(other >= 0)
-            near = self._clearance[self._cells[here, 1], self._cells[here, 0]]
-            starts.append(here)
-            ends.append(other[here])
-            lengths.append(CELL * np.hypot(*step) * (1.0 + 0.15 / near**2))
+        for step in ((0, 1), (1, 0), (1, 1), (1, -1)):
+            # nothing is clear at the edge, where rows and columns go round
+            joined = is_clear & np.roll(is_clear, step, axis=(0, 1))
+            starts.append(number[joined])
+            ends.append(np.roll(number, step, axis=(0, 1))[joined])
+            lengths.append(np.hypot(*step) * length[joined])
         joined = np.concatenate(lengths), (np.concatenate(starts), np.concatenate(ends))
-        return coo_array(joined, shape=(len(self._cells),) * 2).tocsr()
+        return coo_array(joined, shape=(number.size,) * 2).tocsr()
 
     @functools.lru_cache(maxsize=64)  # noqa: B019 - a floor lives as long as its world
     def _from(self, start: int) -> tuple[FloatArray, IntArray]:
@@ -270,23 +261,18 @@ class _Walk:
         path = floor.path(self._place, goal)
         length = se3.distance_along(path)
         along = np.linspace(0.0, length[-1], max(int(length[-1] / 0.02), 8))
-        path = np.stack([np.interp(along, length, axis) for axis in path.T], axis=1)
-        rows = np.arange(len(path))
-        ahead = np.minimum(rows + 25, rows[-1])
-        behind = np.minimum(rows, max(len(path) - 26, 0))
-        towards = path[ahead] - path[behind]
-        heading = np.unwrap(np.arctan2(towards[:, 1], towards[:, 0]))
+        path = se3.interpolated(along, length, path)
+        ahead = np.gradient(gaussian_filter1d(path, 12.0, axis=0, mode="nearest"), axis=0)
+        heading = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
         self._turn_by(float((heading[0] - self._yaw + np.pi) % (2.0 * np.pi) - np.pi))
         heading += self._yaw - heading[0]
-        pace = np.minimum(np.minimum(along, along[-1] - along) + 0.15, 0.5) / 0.5 * self._gait.speed
-        walking, turning = np.diff(along) / pace[1:], np.abs(np.diff(heading)) / (0.8 * self._turn)
+        pace = np.minimum(np.minimum(along, along[-1] - along) + 0.15, 0.5) / 0.5
+        walking = np.diff(along) / (pace[1:] * self._gait.speed)
+        turning = np.abs(np.diff(heading)) / (0.8 * self._turn)
         arrival = np.concatenate([[0.0], np.cumsum(np.maximum(walking, turning))])
         ticks = np.arange(1, int(arrival[-1] * CLOCK) + 1) / CLOCK
-        at = np.interp(ticks, arrival, rows)
-        channels = *path.T, heading, pace
-        x, y, yaw, walked = (np.interp(at, rows, channel) for channel in channels)
-        level = np.zeros_like(at)
-        self._parts.append(np.stack([x, y, yaw, level, walked / self._gait.speed], axis=1))
+        channels = np.column_stack([path, heading, np.zeros_like(pace), pace])
+        self._parts.append(se3.interpolated(ticks, arrival, channels))
         self._yaw, self._place = float(heading[-1]), goal
 
     def _look_round(self) -> None:

@@ -139,18 +139,14 @@ class Interior:
 
     def _doorway(self, door: Rectangle) -> None:
         """Jambs, lintel and threshold of an opening."""
-        x0, y0, x1, y1 = door
-        east = np.array([x1 - x0, 0, 0])
-        north = np.array([0, y1 - y0, 0])
-        up = DOOR_HEIGHT * UP
-        corner = np.array([x0, y0, 0.0])
-        if x1 - x0 > WALL + 0.01:
-            jambs = (corner, north), (corner + east + north, -north)
-        else:
-            jambs = (corner + east, -east), (corner + north, east)
-        lintel, threshold = (corner + up, north, east), (corner, east, north)
-        for quad in (*((foot, along, up) for foot, along in jambs), lintel, threshold):
-            self.site.quad(*quad, self.frame_look)
+        is_wide = door[2] - door[0] > WALL + _TOUCHES
+        place, width = self.site.side(door, 0 if is_wide else 1)
+        corner, up = place.origin, DOOR_HEIGHT * UP
+        along, through = width * place.frame[0], WALL * place.frame[1]
+        self.site.quad(corner, through, up, self.frame_look)
+        self.site.quad(corner + along + through, -through, up, self.frame_look)
+        self.site.quad(corner + up, through, along, self.frame_look)
+        self.site.quad(corner, along, through, self.frame_look)
 
     def _panel(self, corner: FloatArray, along: FloatArray, up: FloatArray, look: int) -> None:
         """A parallelogram, vertices at most ``_STEP`` apart, textured in metres from its corner."""

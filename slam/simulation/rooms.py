@@ -19,6 +19,7 @@ from slam.simulation.world import (
     Hits,
     SimulatedWorld,
     Surface,
+    between,
     place_rays,
     square_camera,
     through_lens,
@@ -119,12 +120,7 @@ class SimulatedRooms(SimulatedWorld):
 
     def _light(self, triangle: NDArray[np.int64], barycentric: Float32Array) -> Float32Array:
         """Irradiance at points of triangles ``(N,)``; of what glows, its own light."""
-        corners = np.take(self._irradiance, triangle, axis=1)
-        light = (
-            corners[0]
-            + barycentric[0] * (corners[1] - corners[0])
-            + barycentric[1] * (corners[2] - corners[0])
-        )
+        light = between(np.take(self._irradiance, triangle, axis=1), barycentric)
         glow = _GLOW[np.take(self._still.mesh.material, triangle)]
         return np.where(glow > 0.0, glow, light)
 

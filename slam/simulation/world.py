@@ -55,6 +55,13 @@ def place_rays(T_scene_sensor: FloatArray, directions: Float32Array) -> Float32A
     return rays.reshape(-1, 6)
 
 
+def between(corners: Float32Array, barycentric: Float32Array) -> Float32Array:
+    """Values at points of triangles by those of the three corners ``(3, ..., N)``, ``(..., N)``."""
+    first, second, third = corners
+    b1, b2 = barycentric
+    return first + b1 * (second - first) + b2 * (third - first)
+
+
 @dataclass(frozen=True)
 class Hits:
     """Rays that met a surface."""
@@ -73,8 +80,7 @@ class Hits:
         mesh = self.surface.mesh
         u_size, v_size = self._footprint(self.depth / np.float32(focal_px))
         corners = np.take(mesh.uv, self.triangle, axis=2)  # (3, 2, N)
-        b1, b2 = self.barycentric
-        u, v = corners[0] + b1 * (corners[1] - corners[0]) + b2 * (corners[2] - corners[0])
+        u, v = between(corners, self.barycentric)
         instances = np.take(mesh.instance, self.triangle)
         materials = np.take(mesh.material, self.triangle)
         rgb = np.empty((3, len(self.triangle)), dtype=np.float32)

@@ -1,6 +1,6 @@
 """The calibration of a camera and its lens by images of a board.
 
-Corners are found, the views that say most of a camera are chosen, and the camera is fitted to them;
+Corners are found, sharp views are chosen, and the camera is fitted to them;
 what makes a fit no calibration is said.
 """
 
@@ -158,15 +158,13 @@ class View:
         frame: its number.
         pixels: the corners ``(N, 2)``.
         corners_m: the same on the board ``(N, 3)``.
-        sharpness: variance of the Laplacian on the board over the variance of its grey levels.
-        place: where and how the board is seen ``(5,)``: its middle, its size and its tilt about both axes.
+        sharpness: of the image on the board.
     """
 
     frame: int
     pixels: FloatArray
     corners_m: FloatArray
     sharpness: float
-    place: FloatArray
 
 
 def find_views(images: ImageSource, board: Board, progress: Progress) -> list[View]:
@@ -183,7 +181,7 @@ def find_views(images: ImageSource, board: Board, progress: Progress) -> list[Vi
         grey = np.asarray(cv2.cvtColor(images.read(frame), cv2.COLOR_RGB2GRAY), np.uint8)
         found = found_corners(grey, board, detector)
         if found:
-            views.append(_view(frame, grey, *found))
+            views.append(View(frame, *found, _sharpness(grey, found[0])))
         elif count == FEWEST_VIEWS and not views:
             text = "none of %d images shows the whole %s so far: --board counts the corners between its squares"
             logger.warning(text, count, board.describe())
@@ -198,38 +196,19 @@ def find_views(images: ImageSource, board: Board, progress: Progress) -> list[Vi
 
 
 def chosen_views(views: list[View]) -> list[View]:
-    """At most 40 views that differ most from each other, sharp ones first, in the order of time.
-
-    The next is always the one whose place is furthest from those of all before, times its sharpness' rank.
-    """
+    """The sharpest view of each of 40 stretches of the recording, blurred ones left out."""
     usual = median([view.sharpness for view in views])
     sharp = [view for view in views if view.sharpness >= _BLURRED * usual]
-    if len(sharp) <= _MOST_VIEWS:
-        return sharp
-    ranks = np.argsort(np.argsort([view.sharpness for view in sharp])) / (len(sharp) - 1)
-    places = np.array([view.place for view in sharp])
-    taken = [int(np.argmax(ranks))]
-    distances = np.full(len(sharp), np.inf)
-    while len(taken) < _MOST_VIEWS:
-        distances = np.minimum(distances, np.linalg.norm(places - places[taken[-1]], axis=1))
-        taken.append(int(np.argmax(distances * (1 + ranks))))
-    return [sharp[k] for k in sorted(set(taken))]
+    stretches = np.array_split(np.arange(len(sharp)), min(_MOST_VIEWS, len(sharp)))
+    return [max((sharp[k] for k in each), key=lambda view: view.sharpness) for each in stretches]
 
 
-def _view(frame: int, grey: Grey, pixels: FloatArray, corners_m: FloatArray) -> View:
-    height, width = grey.shape
+def _sharpness(grey: Grey, pixels: FloatArray) -> float:
+    """Variance of the Laplacian on the board over the variance of its grey levels."""
     hull = cv2.convexHull(pixels.astype(np.float32))
     mask = cv2.fillConvexPoly(np.zeros_like(grey), np.rint(hull).astype(np.int32), 255) > 0
-    sharpness = float(
-        cv2.Laplacian(grey, cv2.CV_64F)[mask].var() / max(float(grey[mask].var()), 1.0)
-    )
-    extent = np.ptp(corners_m[:, :2], axis=0)
-    plane = (corners_m[:, :2] - corners_m[:, :2].mean(axis=0)) / extent
-    homography, _ = cv2.findHomography(plane, pixels / width)
-    tilt = np.zeros(2) if homography is None else homography[2, :2] / homography[2, 2]
-    middle = pixels.mean(axis=0) / [width, height]
-    size = np.sqrt(cv2.contourArea(hull) / (width * height))
-    return View(frame, pixels, corners_m, sharpness, np.array([*middle, size, *tilt]))
+    edges = cv2.Laplacian(grey, cv2.CV_64F)[mask]
+    return float(edges.var() / max(float(grey[mask].var()), 1.0))
 
 
 @dataclass(frozen=True, eq=False)

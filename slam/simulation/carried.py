@@ -43,12 +43,11 @@ class Floor:
 
     def __init__(self, interior: Interior, seed: int) -> None:
         """Find what is free, and places in every room that can be reached."""
-        house = interior.house
-        areas = np.array([room.area for room in house.rooms])
+        areas = np.array([room.area for room in interior.rooms])
         self._origin = areas[:, :2].min(axis=0) - 0.5
         columns, rows = np.ceil((areas[:, 2:].max(axis=0) + 0.5 - self._origin) / CELL).astype(int)
         free = np.zeros((rows, columns), dtype=np.uint8)
-        for rectangles, value in (([*areas, *house.doors], 1), (interior.obstacles, 0)):
+        for rectangles, value in (([*areas, *interior.doors], 1), (interior.obstacles, 0)):
             for rectangle in rectangles:
                 corners = (np.reshape(rectangle, (2, 2)) - self._origin) / CELL
                 (left, low), (right, high) = np.rint(corners).astype(int)
@@ -65,7 +64,7 @@ class Floor:
         roomy &= part == np.bincount(part).argmax()
         chosen: list[int] = []
         rooms: list[int] = []
-        for number, room in enumerate(house.rooms):  # up to five places a room
+        for number, room in enumerate(interior.rooms):  # up to five places a room
             inside = np.flatnonzero(roomy & room.contains(self._centres))
             found = rng.choice(inside, min(len(inside), 5), replace=False)
             chosen.extend(found)
@@ -176,31 +175,18 @@ class Carried:
         x, y, yaw, pitch, moved = base.T
         step = np.cumsum(moved * gait.speed / CLOCK) / _STRIDE_M * 2.0 * np.pi
         free = np.clip(floor.clearance(base[:, :2]) - _CARRIER_CLEAR_M, 0.0, 1.0)
-        side = moved * gait.sway_m * np.sin(0.5 * step) + gait.sway_m * _unrest(rng, count, 0.6)
-        side = np.clip(side, -free, free)
-        unsteady = np.deg2rad(gait.tremor_deg)
-        wander = np.deg2rad(gait.wander_deg) * (0.3 + 0.7 * moved)
-        tremors = [
-            unsteady * (_unrest(rng, count, 0.05) + 0.7 * _unrest(rng, count, 0.25))
-            for _ in range(3)
-        ]
-        height = rng.uniform(*gait.height_m) + gait.climb_m * _unrest(rng, count, 1.5)
+        sways, climbs, turns, nods, rolls = _unrest(rng, (5, count), 0.9)
+        tremors = _unrest(rng, (3, count), 0.05) + 0.7 * _unrest(rng, (3, count), 0.25)
+        side = np.clip(gait.sway_m * (moved * np.sin(0.5 * step) + sways), -free, free)
+        height = rng.uniform(*gait.height_m) + gait.climb_m * climbs
         z = height + moved * gait.bob_m * np.cos(step)
-        yaw = yaw + wander * _unrest(rng, count, 0.9) + tremors[0]
-        pitch = (
-            pitch
-            + np.deg2rad(gait.pitch_deg)
-            + wander / 3.0 * _unrest(rng, count, 0.9)
-            + tremors[1]
-        )
-        roll = (
-            np.deg2rad(gait.roll_deg) * _unrest(rng, count, 0.8)
-            + 0.3 * moved * gait.sway_m * np.cos(0.5 * step)
-            + tremors[2]
-        )
-        self._channels = np.stack(
-            [x + side * np.sin(yaw), y - side * np.cos(yaw), z, yaw, -pitch, roll], axis=1
-        )
+        wander = np.deg2rad(gait.wander_deg) * (0.3 + 0.7 * moved)
+        yaw = yaw + wander * turns
+        pitch = pitch + np.deg2rad(gait.pitch_deg) + wander / 3.0 * nods
+        swing = 0.3 * moved * gait.sway_m * np.cos(0.5 * step)
+        roll = np.deg2rad(gait.roll_deg) * rolls + swing
+        angles = np.stack([yaw, -pitch, roll]) + np.deg2rad(gait.tremor_deg) * tremors
+        self._channels = np.vstack([x + side * np.sin(yaw), y - side * np.cos(yaw), z, angles]).T
 
     def at(self, seconds: FloatArray) -> FloatArray:
         """The channels at times ``(N,)``, ``(N, 6)``; its ends are held."""
@@ -214,13 +200,10 @@ class Carried:
         return se3.make(R_scene_carrier @ R_CARRIER_CAMERA, channels[:, :3])
 
 
-def _unrest(rng: np.random.Generator, count: int, seconds: float) -> FloatArray:
-    """Noise of unit deviation within two and a half that is smooth over a time, ``(count,)``."""
+def _unrest(rng: np.random.Generator, shape: tuple[int, int], seconds: float) -> FloatArray:
+    """Noise of unit deviation within two and a half, smooth over a time along the last axis."""
     sigma = seconds * CLOCK
-    margin = int(4.0 * sigma)
-    noise = gaussian_filter1d(rng.standard_normal(count + 2 * margin), sigma)[
-        margin : margin + count
-    ]
+    noise = gaussian_filter1d(rng.standard_normal(shape), sigma, mode="wrap")
     return np.clip(noise * np.sqrt(3.54 * sigma), -2.5, 2.5)
 
 

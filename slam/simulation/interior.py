@@ -39,26 +39,8 @@ class Room:
         return np.asarray(((points > (x0, y0)) & (points < (x1, y1))).all(axis=1))
 
 
-@dataclass(frozen=True)
-class House:
-    """Rooms, and doorways as the rectangles of the walls that they cut."""
-
-    rooms: list[Room]
-    doors: list[Rectangle]
-
-    def openings(self, wall: Site, length: float) -> list[tuple[float, float]]:
-        """Where the doors in a wall begin and end along it, in order."""
-        found = []
-        for door in self.doors:
-            corners = (np.reshape(door, (2, 2)) - wall.origin[:2]) @ wall.frame[:2, :2].T
-            (start, end), (_, inwards) = np.sort(corners, axis=0).T
-            if abs(inwards) < _TOUCHES and start > 0.0 and end < length:
-                found.append((start, end))
-        return sorted(found)
-
-
-def draw_house(seed: int) -> House:
-    """The plan of a world."""
+def draw_plan(seed: int) -> tuple[list[Room], list[Rectangle]]:
+    """The rooms of a house, and its doorways as the rectangles of the walls that they cut."""
     rng = luck(seed, 50)
     length, width, height = rng.uniform((14.0, 1.9, 2.45), (20.0, 2.4, 2.9)).tolist()
     corridor = Room("corridor", (0.0, 0.0, length, width), height, (3,))
@@ -84,14 +66,15 @@ def draw_house(seed: int) -> House:
                 middle = width + WALL + 1.2 if north else -WALL - 2.2
                 doors.append((before, middle, start, middle + 1.0))
             before, start = end, end + WALL
-    return House(rooms, doors)
+    return rooms, doors
 
 
 class Interior:
     """A furnished house: its walls, furniture and lamps.
 
     Attributes:
-        house: its plan.
+        rooms: between their walls.
+        doors: doorways as the rectangles of the walls that they cut.
         mesh: all surfaces.
         obstacles: what stands on the floors, in plan.
         lights: position and strength of lamps and windows, ``(L, 4)``.
@@ -100,14 +83,15 @@ class Interior:
     def __init__(self, seed: int) -> None:
         """The house of a world."""
         self.rng = rng = luck(seed, 51)
-        self.house, self.site = draw_house(seed), Site(rng)
+        self.site = Site(rng)
+        self.rooms, self.doors = draw_plan(seed)
         self.obstacles: list[Rectangle] = []
         self._lights: list[tuple[float, float, float, float]] = []
         self.frame_look = self.site.instance("wood", "wood")
         self.skirting = self.site.colour("skirting")
-        for room in self.house.rooms:
+        for room in self.rooms:
             self._enclose_and_fill(room)
-        for door in self.house.doors:
+        for door in self.doors:
             self._doorway(door)
         self.mesh, self.lights = self.site.finish(FLAT), np.array(self._lights)
 
@@ -161,7 +145,7 @@ class Interior:
     def _furnish(self, room: Room, number: int, wall: int) -> None:
         """One wall around its doors, seen from inside, with windows, furniture and pictures."""
         rng, (foot, length) = self.rng, self.site.side(room.area, number)
-        openings = self.house.openings(foot, length)
+        openings = self._openings(foot, length)
         for k, (start, end) in enumerate(pairwise([0.0, *np.ravel(openings), length])):
             low = DOOR_HEIGHT * (k % 2)
             corner = foot.moved(end, up=low).origin
@@ -188,6 +172,16 @@ class Interior:
             if not daylight and not (stands and piece in TALL) and rng.random() < 0.6:
                 self._hang(place, width)
             left += width + rng.uniform(0.05, 0.5)
+
+    def _openings(self, wall: Site, length: float) -> list[tuple[float, float]]:
+        """Where the doors in a wall begin and end along it, in order."""
+        found = []
+        for door in self.doors:
+            corners = (np.reshape(door, (2, 2)) - wall.origin[:2]) @ wall.frame[:2, :2].T
+            (start, end), (_, inwards) = np.sort(corners, axis=0).T
+            if abs(inwards) < _TOUCHES and start > 0.0 and end < length:
+                found.append((start, end))
+        return sorted(found)
 
     def _place(self, piece: Piece, place: Site, width: float) -> None:
         depth = piece(place, width)

@@ -26,8 +26,8 @@ def irradiance_of(seed: int, some_are_dim: bool) -> Float32Array:
     interior = interior_of(seed)
     lights = interior.lights.copy()
     if some_are_dim:
-        strength = np.exp(luck(seed, 54).uniform(-1.5, 0.5, len(interior.house.rooms)))
-        for room, factor in zip(interior.house.rooms, strength):
+        strength = np.exp(luck(seed, 54).uniform(-1.5, 0.5, len(interior.rooms)))
+        for room, factor in zip(interior.rooms, strength):
             lights[room.contains(lights[:, :2]), 3] *= factor
     surface, mesh = Surface(interior.mesh), interior.mesh
     triangles = mesh.triangles.astype(np.int64)

@@ -178,22 +178,18 @@ def _lines(rng: np.random.Generator, count: int, spacing: float) -> FloatArray:
     return np.concatenate([[-MARGIN], [0.0], np.cumsum(gaps), [gaps.sum() + MARGIN]])
 
 
-def _outline(cells: set[Node]) -> dict[tuple[Node, Node], None]:
+def _outline(cells: set[Node]) -> list[tuple[Node, Node]]:
     """Directed edges around a set of cells, cells on the left."""
-    edges: dict[tuple[Node, Node], None] = {}
+    edges = {}
     for x, y in sorted(cells):
         ring = [(x, y), (x + 1, y), (x + 1, y + 1), (x, y + 1)]
-        for edge in zip(ring, ring[1:] + ring[:1]):
-            if edge[::-1] in edges:
-                del edges[edge[::-1]]
-            else:
-                edges[edge] = None
-    return edges
+        edges |= dict.fromkeys(zip(ring, ring[1:] + ring[:1]))
+    return [edge for edge in edges if edge[::-1] not in edges]
 
 
-def _trace(outline: dict[tuple[Node, Node], None]) -> list[Node] | None:
+def _trace(outline: list[tuple[Node, Node]]) -> list[Node] | None:
     """Chain an outline into one cycle; None if it touches itself or has a hole."""
-    following = dict(outline.keys())
+    following = dict(outline)
     if len(following) < len(outline):
         return None
     first = next(iter(following))

@@ -4,7 +4,7 @@ Surfaces are ray-cast with Open3D; everything else is NumPy (``slam/simulation``
 """
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -246,31 +246,21 @@ class Weather:
     contrast: float = 1.0  # of textures, an exponent; 1 as they are painted
 
 
-def _draw_sun(rng: np.random.Generator, lowest: float, highest: float) -> FloatArray:
-    """Its direction at an elevation in radians, ``(3,)``."""
-    azimuth, elevation = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(lowest, highest)
-    level = np.cos(elevation)
-    sun = [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
-    return np.array(sun)
-
-
-def _draw_tint(
-    rng: np.random.Generator, tint: tuple[float, ...], spread: float, bright: float = 1.0
-) -> Float32Array:
-    """A colour of the sky near another, ``(3,)``."""
-    return np.asarray(bright * (tint + rng.uniform(-spread, spread, 3)), dtype=np.float32)
-
-
 def draw_weather(seed: int) -> Weather:
     """Weather of a world."""
     rng = luck(seed, 20)
-    sun, sunshine = _draw_sun(rng, 0.5, 1.1), rng.uniform(0.25, 0.75)
+    azimuth, elevation = rng.uniform((0.0, 0.5), (2.0 * np.pi, 1.1))
+    level = np.cos(elevation)
+    sun = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+    sunshine = rng.uniform(0.25, 0.75)
+    sky = np.array([(0.38, 0.56, 0.85), (0.80, 0.84, 0.88)]) + rng.uniform(-0.06, 0.06, (2, 3))
+    zenith, horizon = sky.astype(np.float32)
     return Weather(
         sun=sun.astype(np.float32),
         sunshine=sunshine,
         ambient=0.95 - 0.6 * sunshine,
-        zenith=_draw_tint(rng, (0.38, 0.56, 0.85), 0.06),
-        horizon=_draw_tint(rng, (0.80, 0.84, 0.88), 0.06),
+        zenith=zenith,
+        horizon=horizon,
         clouds=rng.uniform(0.0, 1.0),
         visibility_m=rng.uniform(220.0, 600.0),
         exposure=rng.uniform(0.95, 1.2),
@@ -278,29 +268,27 @@ def draw_weather(seed: int) -> Weather:
 
 
 def draw_varied_weather(seed: int) -> Weather:
-    """Weather of a varied world.
+    """Weather of a varied world: under the same sun another light, and another camera's gain.
 
     Three in four have a sun beside which shadows are 3 to 10 times as dark.
     """
-    rng = luck(seed, 21)
-    sun = _draw_sun(rng, 0.3, 1.15)
-    sunny = rng.random() < 0.75
-    ambient = (
-        1.0 / float(np.exp(rng.uniform(np.log(3.0), np.log(10.0))))
-        if sunny
-        else rng.uniform(0.6, 0.95)
-    )
-    bright = rng.uniform(0.6, 1.3) if sunny else rng.uniform(0.9, 1.4)
-    return Weather(
-        sun=sun.astype(np.float32),
-        sunshine=(1.0 - ambient) / sun[2],  # a level road has 1 in the sun
+    rng, usual = luck(seed, 21), draw_weather(seed)
+    if rng.random() < 0.75:
+        ambient = np.exp(-rng.uniform(np.log(3.0), np.log(10.0)))
+        bright, clouds, saturated = rng.uniform((0.6, 0.0, 0.04), (1.3, 0.8, 0.11))
+    else:
+        ambient = rng.uniform(0.6, 0.95)
+        bright, clouds, saturated = rng.uniform((0.9, 0.6, 0.0), (1.4, 1.0, 0.04))
+    return replace(
+        usual,
+        sunshine=(1.0 - ambient) / usual.sun[2],  # a level road has 1 in the sun
         ambient=ambient,
-        zenith=_draw_tint(rng, (0.30, 0.52, 0.85), 0.08, bright),
-        horizon=_draw_tint(rng, (0.80, 0.86, 0.92), 0.08, bright),
-        clouds=rng.uniform(0.0, 0.8) if sunny else rng.uniform(0.6, 1.0),
+        zenith=np.float32(bright) * usual.zenith,
+        horizon=np.float32(bright) * usual.horizon,
+        clouds=clouds,
         visibility_m=rng.uniform(300.0, 1500.0),
         exposure=None,
-        saturated=rng.uniform(0.04, 0.11) if sunny else rng.uniform(0.0, 0.04),
+        saturated=saturated,
         contrast=rng.uniform(1.2, 3.0),
     )
 

@@ -6,7 +6,6 @@ would make code of them.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -114,17 +113,10 @@ class Bag:
             parse = self._types.deserialize_ros1 if self._is_ros1 else self._types.deserialize_cdr
             return parse(data, self.types[topic])
 
-    def stamp_ns(self, data: bytes) -> int:
-        """The stamp in nanoseconds of a message as stored whose first field is a header, without reading all of it."""
-        with self._errors():
-            if self._is_ros1:
-                # after the sequence number
-                seconds, nanoseconds = struct.unpack_from("<II", data, 4)
-            else:
-                order = "<" if data[1] & 1 else ">"
-                # after the encapsulation
-                seconds, nanoseconds = struct.unpack_from(f"{order}iI", data, 4)
-        return int(seconds) * _NANOSECONDS + int(nanoseconds)
+    def stamp_ns(self, topic: str, data: bytes) -> int:
+        """The stamp in nanoseconds of a message as stored that has a header."""
+        stamp = self.parse(topic, data).header.stamp
+        return int(stamp.sec) * _NANOSECONDS + int(stamp.nanosec)
 
     def close(self) -> None:
         """Close the file; nothing can be read any more."""

@@ -65,7 +65,7 @@ class StampedMessages:
         stamps_ns = []
         for time_ns, data in bag.raw(topic):
             self._times_ns.append(time_ns)
-            stamps_ns.append(bag.stamp_ns(data))
+            stamps_ns.append(bag.stamp_ns(topic, data))
         if not stamps_ns:
             raise SequenceError(f"topic {topic} of {bag.path} has no messages")
         if not any(stamps_ns):

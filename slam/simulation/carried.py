@@ -108,8 +108,8 @@ class Floor:
             starts.append(number[joined])
             ends.append(np.roll(number, step, axis=(0, 1))[joined])
             lengths.append(np.hypot(*step) * length[joined])
-        joined = np.concatenate(lengths), (np.concatenate(starts), np.concatenate(ends))
-        return coo_array(joined, shape=(number.size,) * 2).tocsr()
+        table = np.concatenate(lengths), (np.concatenate(starts), np.concatenate(ends))
+        return coo_array(table, shape=(number.size,) * 2).tocsr()
 
     @functools.lru_cache(maxsize=64)  # noqa: B019 - a floor lives as long as its world
     def _from(self, start: int) -> tuple[FloatArray, IntArray]:

@@ -123,7 +123,7 @@ def fence(site: Site, length: float) -> None:
         length,
         max(spacing, length / 120),
         height,
-        rng.uniform((0.015, 0.008), 0.05),
+        rng.uniform((0.015, 0.008), 0.05).tolist(),
         np.linspace(1.0, 0.25, rng.integers(1, 5)),
         steel,
     )

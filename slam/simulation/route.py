@@ -180,7 +180,7 @@ def _lines(rng: np.random.Generator, count: int, spacing: float) -> FloatArray:
 
 def _outline(cells: set[Node]) -> list[tuple[Node, Node]]:
     """Directed edges around a set of cells, cells on the left."""
-    edges = {}
+    edges: dict[tuple[Node, Node], None] = {}
     for x, y in sorted(cells):
         ring = [(x, y), (x + 1, y), (x + 1, y + 1), (x, y + 1)]
         edges |= dict.fromkeys(zip(ring, ring[1:] + ring[:1]))

@@ -52,18 +52,18 @@ def draw_plan(seed: int) -> tuple[list[Room], list[Rectangle]]:
     kinds = list(rng.permutation(KINDS)) + list(rng.permutation(KINDS))
     for north in (False, True):
         start, before = 0.0, None
+        wall = width if north else -WALL  # of the corridor, its southern side
         while length - start > 3.2:
             end = start + rng.uniform(3.4, 6.0)
             end = length if length - end < 3.4 + WALL else end
             depth = rng.uniform(3.4, 5.5)
-            low, high = (width + WALL, width + WALL + depth) if north else (-WALL - depth, -WALL)
+            low = wall + WALL if north else wall - depth
             kind, outside = str(kinds.pop()), (2,) if north else (0,)
-            rooms.append(Room(kind, (start, low, end, high), height, outside))
+            rooms.append(Room(kind, (start, low, end, low + depth), height, outside))
             door = start + rng.uniform(0.75, end - start - 1.85)
-            wall = (width, low) if north else (high, 0.0)
-            doors.append((door, wall[0], door + rng.uniform(0.95, 1.1), wall[1]))
+            doors.append((door, wall, door + rng.uniform(0.95, 1.1), wall + WALL))
             if before is not None and rng.random() < 0.5:
-                middle = width + WALL + 1.2 if north else -WALL - 2.2
+                middle = low + 1.2 if north else wall - 2.2
                 doors.append((before, middle, start, middle + 1.0))
             before, start = end, end + WALL
     return rooms, doors

@@ -38,22 +38,20 @@ def building(site: Site, width: float, depth: float) -> None:
 def _gable(site: Site, size: tuple[float, float, float], wall: int, roof: int) -> None:
     """A saddle roof with eaves over a box, its ridge along the longer or the shorter side."""
     width, depth, height = size
-    axis_x, axis_y, axis_z, origin = site.frame
     if site.rng.random() < 0.35:  # ridge across
-        axis_x, axis_y, origin = axis_y, -axis_x, origin + width * axis_x
-        width, depth = depth, width
+        site, width, depth = site.moved(width, turn=np.pi / 2.0), depth, width
     rise = depth * site.rng.uniform(0.25, 0.5)
     eave = 0.4
     drop = eave * rise / (0.5 * depth)
-    left = origin - eave * axis_x - eave * axis_y + (height - drop) * axis_z
-    right = left + (depth + 2 * eave) * axis_y
-    ridge = origin - eave * axis_x + 0.5 * depth * axis_y + (height + rise) * axis_z
-    along = (width + 2 * eave) * axis_x
+    left = site.moved(-eave, -eave, height - drop).origin
+    right = site.moved(-eave, depth + eave, height - drop).origin
+    ridge = site.moved(-eave, 0.5 * depth, height + rise).origin
+    along = (width + 2 * eave) * site.frame[0]
     site.quad(left, along, ridge - left, roof)
     site.quad(right, along, ridge - right, roof)
     for end in (0.0, width):
-        a = origin + end * axis_x + height * axis_z
-        b, c = a + depth * axis_y, a + 0.5 * depth * axis_y + rise * axis_z
+        a, b = (site.moved(end, across, height).origin for across in (0.0, depth))
+        c = site.moved(end, 0.5 * depth, height + rise).origin
         uv = np.array([[[0.0, height], [depth, height]], [[0.5 * depth, height + rise]] * 2])
         site.patch(np.stack([[a, b], [c, c]]), uv, wall)
 

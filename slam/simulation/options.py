@@ -96,17 +96,17 @@ class SimulationOptions:
 
 @dataclass(frozen=True)
 class Variety:
-    """One varied street and its camera."""
+    """One street and its camera."""
 
     kind: StreetKind  # of street
-    steepness: float  # of hills at most, rise over run
-    wavelength_m: float  # of hills
+    # of hills: steepness at most, rise over run, and wavelength, metres; None: gentle ones
+    hills: tuple[float, float] | None
     fov_deg: float  # of the camera, horizontal
     # of the camera's own image, which is shrunk to the size asked for; None: of that size
     aspect: float | None
     # of the lens beside the middle of the image, shares of its width and height
     centre: tuple[float, float]
-    height_m: float  # of the camera above the road at rest
+    height_m: float | None  # of the camera above the road at rest; None: as KITTI's
     pitch: float  # of the camera, downwards, radians
     roll: float  # of the camera about its axis, clockwise, radians
     bonnet: float  # share of the image's height that shows the car's own bonnet; 0 shows none
@@ -122,6 +122,23 @@ class Variety:
         return Intrinsics(width, height, fx, fy, cx, cy)
 
 
+# a town as KITTI odometry 00-02 see theirs (rectified colour camera, 1241 x 376 pixels)
+USUAL = Variety(
+    kind="town",
+    hills=None,
+    fov_deg=float(2.0 * np.rad2deg(np.arctan(0.5 * 1241 / 718.856))),
+    aspect=1241 / 376,
+    centre=(607.6928 / 1241 - 0.5, 185.7157 / 376 - 0.5),
+    height_m=None,
+    pitch=0.0,
+    roll=0.0,
+    bonnet=0.0,
+    vignette=0.0,
+    noise=0.0,
+    blur_px=0.55,
+)
+
+
 def draw_variety(seed: int, lone_road: bool) -> Variety:
     """The variety of a seed; only a lone road is a motorway."""
     rng = np.random.default_rng([seed, 5])
@@ -130,8 +147,10 @@ def draw_variety(seed: int, lone_road: bool) -> Variety:
     height_m = float(np.exp(rng.uniform(np.log(lowest), np.log(highest))))
     return Variety(
         kind="country" if kind == "motorway" and not lone_road else kind,
-        steepness=float(rng.uniform(0.0, 0.06 if kind == "motorway" else 0.1)),
-        wavelength_m=float(rng.uniform(110.0, 260.0)),
+        hills=(
+            float(rng.uniform(0.0, 0.06 if kind == "motorway" else 0.1)),
+            float(rng.uniform(110.0, 260.0)),
+        ),
         fov_deg=float(rng.uniform(50.0, 110.0)),
         aspect=float(rng.uniform(1.0, 3.4)) if rng.random() < 0.6 else None,
         centre=(float(rng.uniform(-0.03, 0.03)), float(rng.uniform(-0.05, 0.05))),

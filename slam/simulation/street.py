@@ -9,27 +9,17 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.runtime.imports import import_open3d
 from slam.simulation.geometry import Float32Array, FloatArray, Mesh, luck
 from slam.simulation.objects import bonnet, car
-from slam.simulation.options import SimulationOptions, draw_variety
+from slam.simulation.options import USUAL, SimulationOptions, draw_variety
 from slam.simulation.route import STEP, Route, plan_route
 from slam.simulation.shapes import things
 from slam.simulation.texture import Axis, Texels
 from slam.simulation.town import build_town
-from slam.simulation.world import (
-    Hits,
-    SimulatedWorld,
-    Surface,
-    place_rays,
-    square_camera,
-    through_lens,
-)
+from slam.simulation.world import Hits, SimulatedWorld, Surface, place_rays, through_lens
 
-# KITTI odometry 00-02 (rectified colour camera), at the size it was recorded at
-KITTI_CAMERA = Intrinsics(1241, 376, 718.856, 718.856, 607.1928, 185.2157)
 STILL_FRAMES = 30  # of a stop: 3 s at 10 frames a second
 BLUR_SAMPLES = 6
 SHUTTER = 0.5  # exposure time of a blurred image over the frame interval
@@ -61,15 +51,14 @@ class SimulatedStreet(SimulatedWorld):
         """
         size = options.width, options.height
         still = STILL_FRAMES if "stop" in options.hazards else 0
-        camera, variety = KITTI_CAMERA.resized(*size), None
-        weather = draw_weather
+        variety, weather = USUAL, draw_weather
         if options.varied:
             variety = draw_variety(options.seed, options.route == "straight")
-            camera, weather = variety.camera(*size), draw_varied_weather
+            weather = draw_varied_weather
         if options.fov_deg is not None:
-            camera = square_camera(*size, options.fov_deg)
+            variety = replace(variety, fov_deg=options.fov_deg, aspect=None, centre=(0.0, 0.0))
         self._route = plan_route(options.route, options.frames, options.seed, still, variety)
-        super().__init__(options, camera, self._route.T_street_camera)
+        super().__init__(options, variety.camera(*size), self._route.T_street_camera)
         self.camera_height_m = self._route.camera_height_m
         self._variety = variety
         self._weather = weather(options.seed)
@@ -124,7 +113,7 @@ class SimulatedStreet(SimulatedWorld):
     @functools.cached_property
     def _bonnet(self) -> list[Mesh]:
         """The bonnet of the own car; none under motion blur, which would smear it."""
-        if self._variety is None or self._variety.bonnet == 0.0 or "blur" in self.options.hazards:
+        if self._variety.bonnet == 0.0 or "blur" in self.options.hazards:
             return []
         rng = luck(self.options.seed, 12)
         below = (
@@ -202,11 +191,11 @@ class SimulatedStreet(SimulatedWorld):
         rgb = rgb * np.float32(self._gain)
         if "rain" in self.options.hazards:
             rgb = rained_on(rgb, self.options.seed, index)
-        rgb = through_lens(rgb, *([] if self._variety is None else [self._variety.blur_px]))
+        rgb = through_lens(rgb, self._variety.blur_px)
         if "exposure" in self.options.hazards:
             gain, gamma = self._exposure[index]
             rgb = np.asarray(gain * np.power(np.clip(rgb, 0.0, 1.0), gamma), dtype=np.float32)
-        if self._variety is not None:
+        if self.options.varied:
             y, x = (np.linspace(-1.0, 1.0, side, dtype=np.float32) for side in rgb.shape[:2])
             falloff = 1.0 - np.float32(0.5 * self._variety.vignette) * (x * x + (y * y)[:, None])
             grain = luck(self.options.seed, 35, index).standard_normal(rgb.shape, dtype=np.float32)

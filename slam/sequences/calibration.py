@@ -14,10 +14,10 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 from scipy.spatial.distance import pdist
-from scipy.spatial.transform import Rotation
 
 from erfsfm.common.progress import Progress
 from slam.frames import Grey
+from slam.geometry import se3
 from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SlamError
@@ -39,6 +39,7 @@ _BLURRED = 0.3  # of the median sharpness
 _FLAGS_HOME = cv2 if hasattr(cv2, "CALIB_RECOMPUTE_EXTRINSIC") else cv2.fisheye  # before OpenCV 5
 _FISHEYE_FLAGS = _FLAGS_HOME.CALIB_RECOMPUTE_EXTRINSIC | _FLAGS_HOME.CALIB_FIX_SKEW
 _OUTLIER = 3.0  # times the median error of a view
+_PARTS = 4  # of the views, without each of which the focal length is found once more
 _GAIN = 0.98  # of the error, below which the sixth power of the radius is worth a coefficient
 _MOST_ERROR_PX = 1.0  # for images 640 pixels wide
 _MOST_FOCAL_SIGMA = 0.005  # of the focal length
@@ -223,7 +224,7 @@ class Calibration:
         views: those used.
         residuals: for each of them, corners found less corners projected ``(N, 2)``, pixels.
         T_camera_board: poses of the board ``(V, 4, 4)``.
-        focal_sigma: standard deviation of the focal length over itself, for errors that are independent.
+        focal_sigma: standard deviation of the focal length over itself.
     """
 
     model: Model
@@ -318,40 +319,33 @@ def _fit(views: list[View], width: int, height: int, model: Model) -> Calibratio
 
 
 def _fit_lens(views: list[View], width: int, height: int, model: Model, flags: int) -> Calibration:
-    """A camera, its residuals, and how sure its focal length is by the normal equations with the poses eliminated."""
+    """A camera, its residuals, and how sure its focal length is: a jackknife over parts of the views."""
     is_fisheye = model == "fisheye"
     calibrate: Any = cv2.fisheye.calibrate if is_fisheye else cv2.calibrateCamera
     project: Any = cv2.fisheye.projectPoints if is_fisheye else cv2.projectPoints
     precision = np.float64 if is_fisheye else np.float32
-    corners = [view.corners_m[None].astype(precision) for view in views]
-    pixels = [view.pixels[None].astype(precision) for view in views]
     start = (np.zeros((3, 3)), np.zeros((4, 1))) if is_fisheye else (None, None)
-    _, K, distortion, turns, places = calibrate(
-        corners, pixels, (width, height), *start, flags=flags
+
+    def solved(used: list[View]) -> Any:
+        corners = [view.corners_m[None].astype(precision) for view in used]
+        pixels = [view.pixels[None].astype(precision) for view in used]
+        _, *found = calibrate(corners, pixels, (width, height), *start, flags=flags)
+        return found
+
+    K, distortion, turns, places = solved(views)
+    T_camera_board = se3.from_rotation_vector(
+        np.reshape(turns, (-1, 3)), np.reshape(places, (-1, 3))
     )
-    distortion = distortion.ravel()[:5]
-    count = 4 + len(distortion)
-    # where the columns of the camera and of the pose are in OpenCV's derivatives
-    of_camera, of_pose = (
-        (slice(count), slice(count, count + 6)) if is_fisheye else (slice(6, 6 + count), slice(6))
-    )
-    residuals, information = [], np.zeros((count, count))
-    T_camera_board = np.tile(np.eye(4), (len(views), 1, 1))
-    for T, view, turn, place in zip(T_camera_board, views, turns, places, strict=True):
-        T[:3, :3], T[:3, 3] = Rotation.from_rotvec(np.ravel(turn)).as_matrix(), np.ravel(place)
-        projected, J = project(view.corners_m[:, None], turn, place, K, distortion)
+    residuals = []
+    for view, turn, place in zip(views, turns, places, strict=True):
+        projected, _ = project(view.corners_m[:, None], turn, place, K, distortion)
         residuals.append(view.pixels - np.asarray(projected, np.float64).reshape(-1, 2))
-        by_pose = J[:, of_pose] @ np.linalg.lstsq(J[:, of_pose], J[:, of_camera], rcond=None)[0]
-        information += J[:, of_camera].T @ (J[:, of_camera] - by_pose)
-    freedom = sum(residual.size for residual in residuals) - count - 6 * len(views)
-    variance = sum(float((residual**2).sum()) for residual in residuals) / max(freedom, 1)
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    inverse = np.linalg.pinv(information / np.outer(scale, scale), hermitian=True) / np.outer(
-        scale, scale
-    )
-    sigma = float(np.sqrt(max(variance * inverse[:2, :2].mean(), 0.0))) / (
-        0.5 * (K[0, 0] + K[1, 1])
-    )
+    focal = []
+    for part in range(_PARTS):
+        others = [view for number, view in enumerate(views) if number % _PARTS != part]
+        focal.append(solved(others)[0][[0, 1], [0, 1]].mean())
+    sigma = float(np.sqrt(_PARTS - 1) * np.std(focal) / np.mean(focal))
+    lens = distortion.ravel()[:5]
     return Calibration(
-        model, width, height, np.asarray(K), distortion, views, residuals, T_camera_board, sigma
+        model, width, height, np.asarray(K), lens, views, residuals, T_camera_board, sigma
     )

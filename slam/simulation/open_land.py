@@ -6,13 +6,13 @@ from slam.simulation import objects
 from slam.simulation.geometry import FloatArray
 from slam.simulation.options import StreetKind
 from slam.simulation.route import KERB
-from slam.simulation.shapes import UP, Rectangle, Site, grid_over
+from slam.simulation.shapes import Rectangle, Site, grid_over
 
 
 def open_land(
     site: Site, kind: StreetKind, grass: int, inner: Rectangle, sides: list[bool]
 ) -> None:
-    """Land that may rise beside the road to a bank, with trees, bushes, hedges, fences or barriers.
+    """Land that may rise beside the road to a bank, with trees, hedges, fences or barriers.
 
     Args:
         site: takes the surfaces.
@@ -41,13 +41,8 @@ def open_land(
         for _ in range(rng.poisson(0.15 * wood * length)):
             far = 15.0 * rng.random() ** 1.5
             spot = edge.moved(rng.uniform(0.0, length), far)
-            z = float(ground(*spot.origin[:2]))
-            if rng.random() < 0.4:
-                bush = site.instance("leaves", "bush", 0.45)
-                size = rng.uniform(0.5, 1.8)
-                site.ball(spot.origin + (z + 0.4 * size) * UP, (size, size, 0.8 * size), bush)
-            elif far > 1.5:
-                objects.tree(spot.moved(0.0, up=z - 0.2), rng.uniform(4.0, 13.0))
+            sunk = float(ground(*spot.origin[:2])) - 0.2
+            objects.tree(spot.moved(0.0, up=sunk), rng.uniform(1.0, min(13.0, 3.0 + 4.0 * far)))
         _edge(edge.moved(0.0, up=KERB), kind, length)
 
 
@@ -62,10 +57,7 @@ def _edge(site: Site, kind: StreetKind, length: float) -> None:
             site.box((0, 0, 0), (length, 0.3, site.rng.uniform(2.5, 5.0)), wall)
     elif luck < 0.3:
         objects.fence(site, length)
-    elif luck < 0.4:
-        objects.hedge(site, length)
     elif luck < 0.6:
-        for along in np.arange(3.0, length, site.rng.uniform(7.0, 14.0)).tolist():
-            objects.tree(site.moved(along, 0.5, -KERB), site.rng.uniform(6.0, 12.0))
+        objects.hedge(site, length)
     elif luck < 0.75:
         objects.barrier(site, length, False)

@@ -109,14 +109,8 @@ class SimulatedRooms(SimulatedWorld):
         rgb = hits.unlit(self.camera.fx)
         if hits.surface is self._still:
             return rgb * self._light(hits.triangle, hits.barycentric)
-        # people are as bright as what is below them
-        down = hits.rays.copy()
-        down[:, :3] += down[:, 3:] * hits.depth[:, None]
-        down[:, 3:] = (0.0, 0.0, -1.0)
-        below = self._still.cast(down)["primitive_ids"].astype(np.int64)
-        below = np.minimum(below, self._irradiance.shape[1] - 1)
-        light = self._irradiance[:, below].mean(axis=0)
-        return rgb * light * (0.85 + 0.15 * hits.normals[2])
+        # people are lit as the house is in the mean
+        return rgb * self._irradiance.mean() * (0.85 + 0.15 * hits.normals[2])
 
     def _light(self, triangle: NDArray[np.int64], barycentric: Float32Array) -> Float32Array:
         """Irradiance at points of triangles ``(N,)``; of what glows, its own light."""

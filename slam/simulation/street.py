@@ -288,42 +288,44 @@ class Traffic:
     def __init__(self, drive: Route, seed: int, overtaking: bool = False) -> None:
         rng = luck(seed, 33)
         self._route = drive
-        # offset in lane samples, per frame, to the left in metres, along the lane or against it
-        self._courses: list[tuple[float, float, float, float]] = []
+        # lane samples at each frame, to the left in metres, along the lane or against it
+        self._courses: list[tuple[FloatArray, float, float]] = []
         meets = rng.uniform(4.0, 15.0)
         while meets < len(drive.sample):
             speed = -rng.uniform(0.7, 1.2) / STEP
-            start = drive.sample[int(meets)] - speed * meets
             left_m = 2.0 * drive.lane_offset_m + rng.uniform(0.0, 0.3)
-            self._courses.append((start, speed, left_m, -1.0))
+            self._courses.append((self._beside_at(meets, speed), left_m, -1.0))
             meets += rng.uniform(12.0, 40.0)
         if overtaking:
             self._plan_passing(luck(seed, 34))
-        self._gap = rng.uniform(9.0, 14.0) / STEP
-        self._leader_leaves = rng.uniform(0.4, 0.8) * len(drive.sample)
-        self._cars = things(rng, [car] * (1 + len(self._courses)))
+        # the one in the camera's lane keeps its distance, until it drives away
+        gap, leaves = rng.uniform(9.0, 14.0), rng.uniform(0.4, 0.8) * len(drive.sample)
+        away = np.maximum(np.arange(len(drive.sample)) - leaves, 0.0)
+        self._courses.insert(0, (drive.sample + (gap + 0.5 * away) / STEP, 0.0, 1.0))
+        self._cars = things(rng, [car] * len(self._courses))
+
+    def _beside_at(self, frame: float, speed: float) -> FloatArray:
+        """Lane samples of a steady car that is beside the camera at a frame."""
+        sample = self._route.sample
+        return sample[int(frame)] + speed * (np.arange(len(sample)) - frame)
 
     def _plan_passing(self, rng: np.random.Generator) -> None:
         """Courses of cars on the camera's left, and of slower ones on its right."""
-        sample = self._route.sample
-        for _ in range(max(1, len(sample) // 12)):
-            beside = int(rng.integers(len(sample)))
+        frames = len(self._route.sample)
+        for _ in range(max(1, frames // 12)):
+            beside = int(rng.integers(frames))
             left = rng.random() < 0.75
             speed = (rng.uniform(1.15, 1.9) if left else rng.uniform(0.2, 0.8)) / STEP
             lanes = rng.uniform(1.5, 2.1) if left else rng.uniform(-1.1, -0.9)
             left_m = min(self._route.lane_offset_m, WIDEST_LANE_M) * lanes
-            self._courses.append((sample[beside] - speed * beside, speed, left_m, 1.0))
+            self._courses.append((self._beside_at(beside, speed), left_m, 1.0))
 
     def placed(self, index: int) -> list[Mesh]:
         """The cars within sight at a frame, in the street frame."""
         camera = self._route.T_street_camera[index, :3, 3]
-        # the one in the camera's lane keeps its distance, until it drives away
-        faster = max(0.0, index - self._leader_leaves) * 0.5 / STEP
-        leader = self._route.sample[index] + self._gap + faster
         seen = []
-        courses = [(leader, 0.0, 0.0, 1.0), *self._courses]
-        for mesh, (start, speed, left_m, way) in zip(self._cars, courses, strict=True):
-            T_street_car = self._at(start + speed * index, left_m, way)
+        for mesh, (samples, left_m, way) in zip(self._cars, self._courses, strict=True):
+            T_street_car = self._at(samples[index], left_m, way)
             # nearer only where the drive crosses itself
             if T_street_car is not None and (
                 2.6 < np.linalg.norm(T_street_car[:3, 3] - camera) < 120.0

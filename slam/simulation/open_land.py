@@ -42,7 +42,7 @@ def open_land(
             far = 15.0 * rng.random() ** 1.5
             spot = edge.moved(rng.uniform(0.0, length), far)
             sunk = float(ground(*spot.origin[:2])) - 0.2
-            objects.tree(spot.moved(0.0, up=sunk), rng.uniform(1.0, min(13.0, 3.0 + 4.0 * far)))
+            objects.tree(spot.moved(0.0, up=sunk), rng.uniform(1.0, min(13.0, 2.0 + 3.0 * far)))
         _edge(edge.moved(0.0, up=KERB), kind, length)
 
 

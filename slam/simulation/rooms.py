@@ -3,7 +3,6 @@
 import functools
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
@@ -107,16 +106,11 @@ class SimulatedRooms(SimulatedWorld):
 
     def _shade(self, hits: Hits, surfaces: list[Surface]) -> Float32Array:
         rgb = hits.unlit(self.camera.fx)
-        if hits.surface is self._still:
-            return rgb * self._light(hits.triangle, hits.barycentric)
-        # people are lit as the house is in the mean
-        return rgb * self._irradiance.mean() * (0.85 + 0.15 * hits.normals[2])
-
-    def _light(self, triangle: NDArray[np.int64], barycentric: Float32Array) -> Float32Array:
-        """Irradiance at points of triangles ``(N,)``; of what glows, its own light."""
-        light = between(np.take(self._irradiance, triangle, axis=1), barycentric)
-        glow = _GLOW[np.take(self._still.mesh.material, triangle)]
-        return np.where(glow > 0.0, glow, light)
+        if hits.surface is not self._still:  # people are lit as the house is in the mean
+            return rgb * self._irradiance.mean() * (0.85 + 0.15 * hits.normals[2])
+        light = between(np.take(self._irradiance, hits.triangle, axis=1), hits.barycentric)
+        glow = _GLOW[np.take(self._still.mesh.material, hits.triangle)]
+        return rgb * np.where(glow > 0.0, glow, light)
 
     def _develop(self, rgb: Float32Array, index: int) -> Float32Array:
         """Gain, lens blur and noise."""
@@ -145,15 +139,12 @@ class SimulatedRooms(SimulatedWorld):
 
     @functools.lru_cache(maxsize=256)  # noqa: B019 - readings are small, worlds are kept for long
     def _brightness(self, tick: int) -> float:
-        """Mean of a coarse image without textures, as the camera's meter sees it."""
+        """Mean of a coarse image without people, as the camera's meter sees it."""
         (pose,) = self._poses(np.array([tick * _METER_S]))
-        few = self._rays[:: max(len(self._rays) // 400, 1)]
-        answer = self._still.cast(place_rays(pose, few))
-        met = np.isfinite(answer["t_hit"])
-        triangle = answer["primitive_ids"][met].astype(np.int64)
-        light = self._light(triangle, answer["primitive_uvs"][met].T)
-        colours = self._still.mesh.colours[0].mean(axis=0)
-        return float(np.minimum(light * colours[self._still.mesh.instance[triangle]], 1.5).mean())
+        every = max(len(self._rays) // 400, 1)
+        rays = place_rays(pose, self._rays[::every])
+        rgb = self._colours([self._still], rays, self._stretch[::every])
+        return float(np.minimum(rgb, 1.5).mean())
 
 
 def _standing(walk: Carried, seconds: float) -> FloatArray:

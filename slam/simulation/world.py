@@ -235,7 +235,14 @@ class SimulatedWorld(ABC):
     def _view(self, surfaces: list[Surface], T_scene_camera: FloatArray) -> Float32Array:
         """Colour ``(H, W, 3)``, about [0, 1], from a pose, or one a row."""
         rays = place_rays(T_scene_camera, self._rays)  # z = 1, so that t is z-depth
-        unit = np.ascontiguousarray(rays[:, 3:].T) / self._stretch  # (3, H * W)
+        rgb = self._colours(surfaces, rays, self._stretch)
+        return rgb.reshape(self.options.height, self.options.width, 3)
+
+    def _colours(
+        self, surfaces: list[Surface], rays: Float32Array, stretch: Float32Array
+    ) -> Float32Array:
+        """Colour along rays ``(N, 6)`` whose directions have lengths ``(N,)``, ``(N, 3)``."""
+        unit = np.ascontiguousarray(rays[:, 3:].T) / stretch  # (3, N)
         answers = [surface.cast(rays) for surface in surfaces]
         depths = np.stack([answer["t_hit"] for answer in answers])
         nearest, depth = np.argmin(depths, axis=0), depths.min(axis=0)
@@ -253,7 +260,7 @@ class SimulatedWorld(ABC):
                 surface, triangle, barycentric, rays[seen], directions, normals, depth[seen], seen
             )
             rgb[seen] = self._shade(hits, surfaces).T
-        return rgb.reshape(self.options.height, self.options.width, 3)
+        return rgb
 
     def _require(self, index: int) -> None:
         if not 0 <= index < len(self):

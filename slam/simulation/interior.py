@@ -212,9 +212,9 @@ class Interior:
             sky = np.array([0.86, 0.92, 0.98]) * rng.uniform(0.9, 1.05)
             pane = place.instance("pane", sky, self.skirting, (width, high, 1.0))
             place.plate((left, 0.0, low), (width, 0.01, high), pane, self.frame_look)
-            x_light, y_light, _ = place.moved(left + 0.5 * width, 0.8).origin
+            light = place.moved(left + 0.5 * width, 0.8, low + 0.6 * high).origin
             strength = (0.35 if room.kind == "hall" else 0.7) * width * high
-            self._lights.append((x_light, y_light, low + 0.6 * high, strength))
+            self._lights.append((*light, strength))
             spans.append((left, left + width))
             left += width + rng.uniform(0.5, 2.5)
         return spans

@@ -188,20 +188,13 @@ def person(site: Site) -> None:
 
 
 def bonnet(site: Site, below: float, height_m: float) -> None:
-    """The bonnet before a camera, in its frame.
+    """The level bonnet before a camera, in its frame.
 
     Its far edge is seen at the slope ``below`` the axis.
     """
     far = min(site.rng.uniform(1.1, 2.0), 0.6 * height_m / max(below, 0.05))
-    x, z = np.meshgrid(np.linspace(-1.1, 1.1, 15), np.linspace(0.25, far, 8))
-    y = (
-        below * far
-        + 0.12 * (far - z) ** 2
-        + 0.10 * x**2
-        + 0.25 * np.clip(np.abs(x) - 0.7, 0.0, None)
-    )
     paint = site.instance("metal", "bonnet")
-    site.patch(np.stack([x, y, z], axis=2), np.stack([x, z], axis=2), paint)
+    site.box((-1.1, below * far, 0.25), (2.2, 1.0, far - 0.25), paint)
 
 
 def car(site: Site) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from slam.simulation.geometry import Material
-from slam.simulation.texture import Lengths, Shader, Texels, cell_hash, grained, mix
+from slam.simulation.texture import Lengths, Shader, Texels, cell_hash, grained, mix, slabs
 
 # light of their own
 GLOWING: dict[Material, float] = {"screen": 1.3, "pane": 2.2, "lamp": 2.5}
@@ -18,17 +18,6 @@ def _plaster(texels: Texels) -> Lengths:
     figure = texels.u.stripes(step, 0.4 * step) * (period > 0)
     rgb = texels.first * (1.0 + grain - contrast * figure)
     return mix(rgb, texels.second * (1.0 + grain), texels.v.band(-1.0, skirting) * (skirting > 0))
-
-
-def _tiles(texels: Texels) -> Lengths:
-    side, joint, checks = texels.parameters[:3]
-    u, v = texels.u.at / side, texels.v.at / side
-    near = np.clip(side / texels.size / 2.0 - 0.5, 0.0, 1.0)
-    tone = 0.07 * near * (cell_hash(u, v, 1) - 0.5)
-    grain = texels.fractal((0.5, 0.4, 0.03), (0.06, 0.05, 0.03))
-    chequered = (np.floor(u) + np.floor(v)) % 2 * checks * near
-    rgb = mix(texels.first * (1.0 + grain + tone), 0.5 * texels.second, chequered)
-    return mix(rgb, texels.second, texels.joints(side, side, joint))
 
 
 def _boards(texels: Texels) -> Lengths:
@@ -104,7 +93,7 @@ def _carton(texels: Texels) -> Lengths:
 
 ROOM_SHADERS: dict[Material, Shader] = {
     "plaster": _plaster,
-    "tiles": _tiles,
+    "tiles": slabs(0.07, (0.5, 0.4, 0.03), (0.06, 0.05, 0.03)),
     "boards": _boards,
     "carpet": _carpet,
     "wood": _wood,

@@ -147,22 +147,22 @@ class _Town:
             for angle in np.linspace(0.0, np.pi / 2.0, 6):
                 along, across = radius * (1.0 - np.array([np.cos(angle), np.sin(angle)]))
                 rim.append(edge.moved(along, across))
-            rim += map(edge.moved, np.arange(ROUNDING + 2.0, length - ROUNDING - 1.0, 2.5))
+            rim += map(edge.moved, np.arange(ROUNDING + 2.0, length - ROUNDING - 1.0, 2.5).tolist())
         outline = np.stack([spot.origin for spot in [*rim, rim[0]]])[:, :2]
         inside = np.clip(outline, [inner[0], inner[1]], [inner[2], inner[3]])
         ring = np.pad(np.stack([outline, inside]), ((0, 0), (0, 0), (0, 1)), constant_values=KERB)
         self.site.patch(ring, ring[..., :2], self.pavement)
-        length = se3.distance_along(outline)
+        around = se3.distance_along(outline)
         step = ring[[0, 0]].copy()
         step[0, :, 2] = -0.1
-        self.site.patch(step, lattice(length, (-0.1, KERB)), self.kerb)
+        self.site.patch(step, lattice(around, (-0.1, KERB)), self.kerb)
         lip = ring[[0, 0]].copy()
         lip[..., 2] += 0.004
         towards = inside - outline
         lip[1, :, :2] += (
             0.16 * towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 0.16)
         )
-        self.site.patch(lip, lattice(length, (0.0, 0.16)), self.kerb)
+        self.site.patch(lip, lattice(around, (0.0, 0.16)), self.kerb)
 
     def _furnish(self, kerb: Site, length: float) -> None:
         """Trees, lamps and signs along a kerb with its block on the left, and cars before it."""
@@ -237,7 +237,7 @@ class _Town:
         rng, xs, ys = self.rng, self.plan.xs, self.plan.ys
         for number in range(4):
             edge, length = self.site.side((xs[0], ys[0], xs[-1], ys[-1]), number)
-            for along in np.arange(0.0, length, 9.0):
+            for along in np.arange(0.0, length, 9.0).tolist():
                 spot = edge.moved(along + rng.uniform(-3, 3), -rng.uniform(6.0, 25.0))
                 if rng.random() < (1.0 if self.open else 0.7):
                     objects.tree(spot, rng.uniform(6.0, 13.0))

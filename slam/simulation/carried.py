@@ -281,6 +281,5 @@ class _Walk:
         self._yaw += angle
 
     def _stay(self, yaw: FloatArray, pitch: FloatArray) -> None:
-        x, y = self._parts[-1][-1, :2] if self._parts else self._floor.places[self._place]
-        x, y, still = (np.full_like(yaw, value) for value in (x, y, 0.0))
-        self._parts.append(np.stack([x, y, yaw, pitch, still], axis=1))
+        place = np.tile(self._floor.places[self._place], (len(yaw), 1))
+        self._parts.append(np.column_stack([place, yaw, pitch, np.zeros_like(yaw)]))

@@ -9,7 +9,7 @@ from slam.frames import Intrinsics
 from slam.runtime.errors import SequenceError
 
 VERSION = 3  # of the worlds: the same options give the same bytes within a version
-MOST_FRAMES = 100_000
+_MOST_FRAMES = 100_000
 STREET_RATE = 10.0
 _MOST_PIXELS = 2**25
 _READOUT_S = 0.025  # of a rolling shutter, where frames are far enough apart
@@ -80,8 +80,8 @@ class SimulationOptions:
             )
         if self.seed < 0:
             raise SequenceError(f"seed must be 0 or more; got {self.seed}")
-        if self.frames > MOST_FRAMES:
-            raise SequenceError(f"a drive has {MOST_FRAMES:,} frames at most; got {self.frames:,}")
+        if not 2 <= self.frames <= _MOST_FRAMES:
+            raise SequenceError(f"a drive has 2 to {_MOST_FRAMES:,} frames; got {self.frames:,}")
         if min(self.width, self.height) < 8 or self.width * self.height > _MOST_PIXELS:
             raise SequenceError(
                 f"images must be 8 x 8 or larger, of {_MOST_PIXELS:,} pixels at most;"

@@ -77,7 +77,6 @@ class SimulatedStreet(SimulatedWorld):
 
     def scan(self, index: int) -> Float32Array:
         """LiDAR points of a frame ``(M, 4)``: x, y, z in the LiDAR, metres, and reflectance."""
-        self._require(index)
         rng = luck(self.options.seed, 40, index)
         # each spin starts at a random angle: with the same rays in every scan the rings on the
         # ground would repeat exactly, and scan matching would estimate zero motion
@@ -211,8 +210,8 @@ def rained_on(rgb: Float32Array, seed: int, index: int) -> Float32Array:
     length = max(3, height // 11)
     kernel = np.zeros((length, length), dtype=np.float32)
     slant = rng.uniform(-0.3, 0.3)
-    for row in range(length):
-        kernel[row, int(length / 2 + slant * (row - length / 2))] = 1.0
+    rows = np.arange(length)
+    kernel[rows, (length / 2 + slant * (rows - length / 2)).astype(int)] = 1.0
     streaks = np.clip(cv2.filter2D(drops, -1, kernel), 0.0, 1.0)[..., None] * 0.4
     veiled = rgb * 0.85 + 0.07
     return veiled + streaks * (0.85 - veiled)

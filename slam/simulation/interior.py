@@ -252,12 +252,17 @@ class Interior:
         rng, (x0, y0, x1, y1) = self.rng, room.area
         bulb = self.site.instance("lamp", (1.0, 0.98, 0.92))
         strength = (0.8 if room.kind == "hall" else 1.0) * rng.uniform(0.8, 1.2)
-        across, along = (max(1, round(extent / 3.4)) for extent in (x1 - x0, y1 - y0))
-        for x in x0 + (np.arange(across) + 0.5) / across * (x1 - x0):
-            for y in y0 + (np.arange(along) + 0.5) / along * (y1 - y0):
+        for x in _middles(x0, x1):
+            for y in _middles(y0, y1):
                 lamp = self.site.moved(x - 0.25, y - 0.15, room.height - 0.06)
                 lamp.box((0, 0, 0.001), (0.5, 0.3, 0.05), bulb)
                 self._lights.append((x, y, room.height - 0.3, strength))
+
+
+def _middles(low: float, high: float) -> list[float]:
+    """Of the equal parts of a stretch, of about 3.4 m."""
+    count = max(1, round((high - low) / 3.4))
+    return (low + (np.arange(count) + 0.5) / count * (high - low)).tolist()
 
 
 # which several motions and hazards share

@@ -23,9 +23,9 @@ def _plaster(texels: Texels) -> Lengths:
 def _boards(texels: Texels) -> Lengths:
     width = texels.parameters[0]
     row = np.floor(texels.v.at / width)
-    along = np.asarray(texels.u.at + 0.9 * cell_hash(row, row, 2), dtype=np.float32)
+    along = texels.u.at + 0.9 * cell_hash(row, row, 2)
     near = np.clip(width / texels.v.size - 1.0, 0.0, 1.0)
-    tone = 0.3 * near * (cell_hash(np.divide(along, 0.9, dtype=np.float32), row, 4) - 0.5)
+    tone = 0.3 * near * (cell_hash(along / 0.9, row, 4) - 0.5)
     veins = texels.fractal((0.9, 0.06, 0.1), (0.25, 0.02, 0.12), (0.08, 0.008, 0.1))
     gaps = np.maximum(texels.v.stripes(width, 0.006), texels.u.on(along).stripes(0.9, 0.006))
     return texels.first * (1.0 + tone + veins) * (1.0 - 0.55 * gaps)

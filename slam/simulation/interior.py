@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.simulation.furniture import STANDING, TALL, Piece, dining
-from slam.simulation.geometry import FLAT, FloatArray, luck
+from slam.simulation.geometry import FLAT, FloatArray, luck, unit
 from slam.simulation.shapes import UP, Rectangle, Site, lattice
 
 WALL = 0.14  # thickness, metres
@@ -134,13 +134,14 @@ class Interior:
 
     def _panel(self, corner: FloatArray, along: FloatArray, up: FloatArray, look: int) -> None:
         """A parallelogram, vertices at most ``_STEP`` apart, textured in metres from its corner."""
-        width, height = float(np.linalg.norm(along)), float(np.linalg.norm(up))
-        a, b = (
-            np.linspace(0.0, 1.0, int(np.ceil(extent / _STEP)) + 1) for extent in (width, height)
-        )
-        points = corner + a[None, :, None] * along + b[:, None, None] * up
-        uv = lattice(a * width, b * height + corner[2] * (up[2] > 0.0))
-        self.site.patch(points, uv, look)
+        sides = np.stack([along, up])
+        ticks = [
+            np.linspace(0.0, extent, int(np.ceil(extent / _STEP)) + 1)
+            for extent in np.linalg.norm(sides, axis=1)
+        ]
+        at = lattice(*ticks)
+        uv = at + np.array([0.0, corner[2] * (up[2] > 0.0)])
+        self.site.patch(corner + at @ unit(sides), uv, look)
 
     def _furnish(self, room: Room, number: int, wall: int) -> None:
         """One wall around its doors, seen from inside, with windows, furniture and pictures."""

@@ -217,7 +217,7 @@ class _Walk:
         self._rng = rng
         self._visits = np.zeros(int(floor.room.max()) + 1)
         self._place = int(rng.integers(len(floor.places)))
-        self._yaw = float(rng.uniform(-np.pi, np.pi))
+        self._yaw = rng.uniform(-np.pi, np.pi)
         self._parts: list[FloatArray] = []
 
     def over(self, ticks: int) -> FloatArray:
@@ -247,7 +247,7 @@ class _Walk:
         path = se3.interpolated(along, length, path)
         ahead = np.gradient(gaussian_filter1d(path, 12.0, axis=0, mode="nearest"), axis=0)
         heading = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
-        self._turn_by(float((heading[0] - self._yaw + np.pi) % (2.0 * np.pi) - np.pi))
+        self._turn_by((heading[0] - self._yaw + np.pi) % (2.0 * np.pi) - np.pi)
         heading += self._yaw - heading[0]
         pace = np.minimum(np.minimum(along, along[-1] - along) + 0.15, 0.5) / 0.5
         walking = np.diff(along) / (pace[1:] * self._gait.speed)
@@ -260,14 +260,12 @@ class _Walk:
 
     def _look_round(self) -> None:
         """Turn on the spot."""
-        self._turn_by(
-            float(self._rng.choice([-1.0, 1.0]) * np.deg2rad(self._rng.uniform(60.0, 360.0)))
-        )
+        self._turn_by(self._rng.choice([-1.0, 1.0]) * np.deg2rad(self._rng.uniform(60.0, 360.0)))
 
     def _sweep(self) -> None:
         """Look left and right, up and down."""
         wide, high = np.deg2rad(self._rng.uniform((20.0, 8.0), (45.0, 25.0)))
-        seconds = max(float(self._rng.uniform(3.0, 5.0)), 2.0 * np.pi * wide / self._turn)
+        seconds = max(self._rng.uniform(3.0, 5.0), 2.0 * np.pi * wide / self._turn)
         phase = np.linspace(0.0, 2.0 * np.pi, int(seconds * CLOCK))
         self._stay(self._yaw + wide * np.sin(phase), high * np.sin(2.0 * phase))
 

@@ -142,23 +142,20 @@ USUAL = Variety(
 def draw_variety(seed: int, lone_road: bool) -> Variety:
     """The variety of a seed; only a lone road is a motorway."""
     rng = np.random.default_rng([seed, 5])
-    kind = _STREET_KINDS[int(rng.choice(4, p=_STREET_SHARES))]
+    kind = _STREET_KINDS[rng.choice(4, p=_STREET_SHARES)]
     lowest, highest = (0.5, 2.5) if rng.random() < 0.5 else (1.2, 2.0)
     height_m = float(np.exp(rng.uniform(np.log(lowest), np.log(highest))))
     return Variety(
         kind="country" if kind == "motorway" and not lone_road else kind,
-        hills=(
-            float(rng.uniform(0.0, 0.06 if kind == "motorway" else 0.1)),
-            float(rng.uniform(110.0, 260.0)),
-        ),
-        fov_deg=float(rng.uniform(50.0, 110.0)),
-        aspect=float(rng.uniform(1.0, 3.4)) if rng.random() < 0.6 else None,
-        centre=(float(rng.uniform(-0.03, 0.03)), float(rng.uniform(-0.05, 0.05))),
+        hills=(rng.uniform(0.0, 0.06 if kind == "motorway" else 0.1), rng.uniform(110.0, 260.0)),
+        fov_deg=rng.uniform(50.0, 110.0),
+        aspect=rng.uniform(1.0, 3.4) if rng.random() < 0.6 else None,
+        centre=(rng.uniform(-0.03, 0.03), rng.uniform(-0.05, 0.05)),
         height_m=height_m,
-        pitch=float(np.deg2rad(rng.uniform(-4.0, 4.0))),
-        roll=float(np.deg2rad(rng.uniform(-2.0, 2.0))),
-        bonnet=float(rng.uniform(0.05, 0.2)) if height_m > 1.1 and rng.random() < 0.3 else 0.0,
-        vignette=float(rng.choice([0.0, rng.uniform(0.0, 0.5)])),
-        noise=float(rng.uniform(0.0, 0.012)),
-        blur_px=float(rng.uniform(0.25, 0.55)),
+        pitch=np.deg2rad(rng.uniform(-4.0, 4.0)),
+        roll=np.deg2rad(rng.uniform(-2.0, 2.0)),
+        bonnet=rng.uniform(0.05, 0.2) if height_m > 1.1 and rng.random() < 0.3 else 0.0,
+        vignette=rng.choice([0.0, rng.uniform(0.0, 0.5)]),
+        noise=rng.uniform(0.0, 0.012),
+        blur_px=rng.uniform(0.25, 0.55),
     )

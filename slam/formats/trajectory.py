@@ -9,7 +9,6 @@ import logging
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,29 +125,31 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
     lines, rows, numbers = _read_numbers(
         path, _COLUMNS.get(format, _COLUMNS["kitti"] + _COLUMNS["tum"]), bad
     )
-    columns, is_finite = numbers.shape[1], np.asarray(np.isfinite(numbers).all(axis=1))
-    checks: list[tuple[Any, str]] = [(is_finite, "a number is not finite")]
-    numbers = np.where(is_finite[:, None], numbers, 0.0)
+    columns, is_finite = numbers.shape[1], np.isfinite(numbers).all(axis=1)
+    lines, rows, numbers = bad.without(
+        [(is_finite, "a number is not finite")], lines, rows, numbers
+    )
     if columns in _COLUMNS["kitti"]:
         T_world_camera = np.tile(np.eye(4), (len(numbers), 1, 1))
         T_world_camera[:, :3] = numbers[:, columns % 4 :][:, :12].reshape(-1, 3, 4)
     else:
         is_unit = np.abs(np.linalg.norm(numbers[:, -4:], axis=1) - 1.0) < _ROTATION_TOLERANCE
-        checks.append((is_unit, "the quaternion does not have length 1"))
-        quaternions_xyzw = np.where(is_unit[:, None], numbers[:, -4:], [0.0, 0.0, 0.0, 1.0])
-        T_world_camera = se3.make(
-            Rotation.from_quat(quaternions_xyzw).as_matrix(), numbers[:, -7:-4]
-        )
+        reason = "the quaternion does not have length 1"
+        lines, rows, numbers = bad.without([(is_unit, reason)], lines, rows, numbers)
+        R_world_camera = Rotation.from_quat(numbers[:, -4:]).as_matrix()
+        T_world_camera = se3.make(R_world_camera, numbers[:, -7:-4])
     if columns == 7:
         T_world_camera = _T_TARTAN_CAMERA.T @ T_world_camera @ _T_TARTAN_CAMERA
     is_near = (np.abs(T_world_camera[:, :3, 3]) <= _FARTHEST).all(axis=1)
-    checks.append((is_near, f"a position is farther than {_FARTHEST:g}"))
     R = T_world_camera[:, :3, :3]
     # an overflow becomes NaN, which fails the check
     with np.errstate(over="ignore", invalid="ignore"):
         deviation = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
         is_rotation = (deviation < _ROTATION_TOLERANCE) & (np.linalg.det(R) > 0)
-    checks.append((is_rotation, "the 3x3 part is not a rotation matrix"))
+    checks = [
+        (is_near, f"a position is farther than {_FARTHEST:g}"),
+        (is_rotation, "the 3x3 part is not a rotation matrix"),
+    ]
     lines, rows, numbers, T_world_camera = bad.without(checks, lines, rows, numbers, T_world_camera)
     timed, numbered = columns == 8, columns in (13, 17)
     stamps = numbers[:, 0] if timed or numbered else rows.astype(np.float64)

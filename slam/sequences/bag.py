@@ -6,7 +6,6 @@ would make code of them.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,9 +29,6 @@ _METADATA = "metadata.yaml"
 _TRANSFORMS = "geometry_msgs/TransformStamped[] transforms"
 _TRANSFORM_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _NANOSECONDS = 10**9
-# MCAP: the footer with the magic bytes behind it, and kinds of records
-_FOOTER_BYTES, _SCHEMA, _CHANNEL = 37, 3, 4
-_ROS_ENCODINGS = ("cdr", "ros1")
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO, POINT_CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
 
@@ -117,17 +113,10 @@ class Bag:
             parse = self._types.deserialize_ros1 if self._is_ros1 else self._types.deserialize_cdr
             return parse(data, self.types[topic])
 
-    def stamp_ns(self, data: bytes) -> int:
-        """The stamp in nanoseconds of a message as stored whose first field is a header, without reading all of it."""
-        with self._errors():
-            if self._is_ros1:
-                # after the sequence number
-                seconds, nanoseconds = struct.unpack_from("<II", data, 4)
-            else:
-                order = "<" if data[1] & 1 else ">"
-                # after the encapsulation
-                seconds, nanoseconds = struct.unpack_from(f"{order}iI", data, 4)
-        return int(seconds) * _NANOSECONDS + int(nanoseconds)
+    def stamp_ns(self, topic: str, data: bytes) -> int:
+        """The stamp in nanoseconds of a message as stored that has a header."""
+        stamp = self.parse(topic, data).header.stamp
+        return int(stamp.sec) * _NANOSECONDS + int(stamp.nanosec)
 
     def close(self) -> None:
         """Close the file; nothing can be read any more."""
@@ -141,47 +130,9 @@ class Bag:
             raise
         except Exception as error:  # of whatever kind a damaged file raises inside rosbags
             reason = one_line(f"{type(error).__name__}: {error}")
-            held = ", ".join(foreign_topics(self.path) if self.path.suffix == ".mcap" else [])
-            if held:
-                cure = "convert it to a bag of ROS 2"
-                raise SequenceError(
-                    f"{self.path} is not of ROS: it holds {held}; {cure}"
-                ) from error
             raise SequenceError(
-                f"bag {self.path} cannot be read ({reason}): copy it again, or reindex it"
+                f"bag {self.path} cannot be read ({reason}): copy it again, reindex it, or convert it to a bag of ROS 2"
             ) from error
-
-
-def foreign_topics(path: Path) -> list[str]:
-    """Topics of an MCAP file with schema and encoding, where that is not of ROS, by the summary at its end."""
-    found, schemas = [], {0: "no schema"}
-    try:
-        data = path.read_bytes()
-        place, end = (
-            struct.unpack_from("<Q", data, len(data) - _FOOTER_BYTES + 9)[0],
-            len(data) - _FOOTER_BYTES,
-        )
-        while 0 < place < end:
-            kind, length = struct.unpack_from("<BQ", data, place)
-            content, place = data[place + 9 : place + 9 + length], place + 9 + length
-            if kind == _SCHEMA:
-                schemas[struct.unpack_from("<H", content)[0]] = _text(content, 2)[0]
-            if kind == _CHANNEL:
-                topic, after = _text(content, 4)
-                encoding = _text(content, after)[0]
-                if encoding not in _ROS_ENCODINGS:
-                    found.append(
-                        f"{topic} ({schemas.get(struct.unpack_from('<H', content, 2)[0])}, {encoding})"
-                    )
-    except (OSError, struct.error, UnicodeDecodeError):
-        return []
-    return found
-
-
-def _text(content: bytes, start: int) -> tuple[str, int]:
-    """A string of MCAP, and where it ends."""
-    (length,) = struct.unpack_from("<I", content, start)
-    return content[start + 4 : start + 4 + length].decode(), start + 4 + length
 
 
 def is_bag(path: Path) -> bool:

@@ -1,6 +1,6 @@
 """The calibration of a camera and its lens by images of a board.
 
-Corners are found, the views that say most of a camera are chosen, and the camera is fitted to them;
+Corners are found, sharp views are chosen, and the camera is fitted to them;
 what makes a fit no calibration is said.
 """
 
@@ -14,10 +14,10 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 from scipy.spatial.distance import pdist
-from scipy.spatial.transform import Rotation
 
 from erfsfm.common.progress import Progress
 from slam.frames import Grey
+from slam.geometry import se3
 from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SlamError
@@ -39,6 +39,7 @@ _BLURRED = 0.3  # of the median sharpness
 _FLAGS_HOME = cv2 if hasattr(cv2, "CALIB_RECOMPUTE_EXTRINSIC") else cv2.fisheye  # before OpenCV 5
 _FISHEYE_FLAGS = _FLAGS_HOME.CALIB_RECOMPUTE_EXTRINSIC | _FLAGS_HOME.CALIB_FIX_SKEW
 _OUTLIER = 3.0  # times the median error of a view
+_PARTS = 4  # of the views, without each of which the focal length is found once more
 _GAIN = 0.98  # of the error, below which the sixth power of the radius is worth a coefficient
 _MOST_ERROR_PX = 1.0  # for images 640 pixels wide
 _MOST_FOCAL_SIGMA = 0.005  # of the focal length
@@ -158,15 +159,13 @@ class View:
         frame: its number.
         pixels: the corners ``(N, 2)``.
         corners_m: the same on the board ``(N, 3)``.
-        sharpness: variance of the Laplacian on the board over the variance of its grey levels.
-        place: where and how the board is seen ``(5,)``: its middle, its size and its tilt about both axes.
+        sharpness: of the image on the board.
     """
 
     frame: int
     pixels: FloatArray
     corners_m: FloatArray
     sharpness: float
-    place: FloatArray
 
 
 def find_views(images: ImageSource, board: Board, progress: Progress) -> list[View]:
@@ -183,7 +182,7 @@ def find_views(images: ImageSource, board: Board, progress: Progress) -> list[Vi
         grey = np.asarray(cv2.cvtColor(images.read(frame), cv2.COLOR_RGB2GRAY), np.uint8)
         found = found_corners(grey, board, detector)
         if found:
-            views.append(_view(frame, grey, *found))
+            views.append(View(frame, *found, _sharpness(grey, found[0])))
         elif count == FEWEST_VIEWS and not views:
             text = "none of %d images shows the whole %s so far: --board counts the corners between its squares"
             logger.warning(text, count, board.describe())
@@ -198,38 +197,19 @@ def find_views(images: ImageSource, board: Board, progress: Progress) -> list[Vi
 
 
 def chosen_views(views: list[View]) -> list[View]:
-    """At most 40 views that differ most from each other, sharp ones first, in the order of time.
-
-    The next is always the one whose place is furthest from those of all before, times its sharpness' rank.
-    """
+    """The sharpest view of each of 40 stretches of the recording, blurred ones left out."""
     usual = median([view.sharpness for view in views])
     sharp = [view for view in views if view.sharpness >= _BLURRED * usual]
-    if len(sharp) <= _MOST_VIEWS:
-        return sharp
-    ranks = np.argsort(np.argsort([view.sharpness for view in sharp])) / (len(sharp) - 1)
-    places = np.array([view.place for view in sharp])
-    taken = [int(np.argmax(ranks))]
-    distances = np.full(len(sharp), np.inf)
-    while len(taken) < _MOST_VIEWS:
-        distances = np.minimum(distances, np.linalg.norm(places - places[taken[-1]], axis=1))
-        taken.append(int(np.argmax(distances * (1 + ranks))))
-    return [sharp[k] for k in sorted(set(taken))]
+    stretches = np.array_split(np.arange(len(sharp)), min(_MOST_VIEWS, len(sharp)))
+    return [max((sharp[k] for k in each), key=lambda view: view.sharpness) for each in stretches]
 
 
-def _view(frame: int, grey: Grey, pixels: FloatArray, corners_m: FloatArray) -> View:
-    height, width = grey.shape
+def _sharpness(grey: Grey, pixels: FloatArray) -> float:
+    """Variance of the Laplacian on the board over the variance of its grey levels."""
     hull = cv2.convexHull(pixels.astype(np.float32))
     mask = cv2.fillConvexPoly(np.zeros_like(grey), np.rint(hull).astype(np.int32), 255) > 0
-    sharpness = float(
-        cv2.Laplacian(grey, cv2.CV_64F)[mask].var() / max(float(grey[mask].var()), 1.0)
-    )
-    extent = np.ptp(corners_m[:, :2], axis=0)
-    plane = (corners_m[:, :2] - corners_m[:, :2].mean(axis=0)) / extent
-    homography, _ = cv2.findHomography(plane, pixels / width)
-    tilt = np.zeros(2) if homography is None else homography[2, :2] / homography[2, 2]
-    middle = pixels.mean(axis=0) / [width, height]
-    size = np.sqrt(cv2.contourArea(hull) / (width * height))
-    return View(frame, pixels, corners_m, sharpness, np.array([*middle, size, *tilt]))
+    edges = cv2.Laplacian(grey, cv2.CV_64F)[mask]
+    return float(edges.var() / max(float(grey[mask].var()), 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +224,7 @@ class Calibration:
         views: those used.
         residuals: for each of them, corners found less corners projected ``(N, 2)``, pixels.
         T_camera_board: poses of the board ``(V, 4, 4)``.
-        focal_sigma: standard deviation of the focal length over itself, for errors that are independent.
+        focal_sigma: standard deviation of the focal length over itself.
     """
 
     model: Model
@@ -339,40 +319,33 @@ def _fit(views: list[View], width: int, height: int, model: Model) -> Calibratio
 
 
 def _fit_lens(views: list[View], width: int, height: int, model: Model, flags: int) -> Calibration:
-    """A camera, its residuals, and how sure its focal length is by the normal equations with the poses eliminated."""
+    """A camera, its residuals, and how sure its focal length is: a jackknife over parts of the views."""
     is_fisheye = model == "fisheye"
     calibrate: Any = cv2.fisheye.calibrate if is_fisheye else cv2.calibrateCamera
     project: Any = cv2.fisheye.projectPoints if is_fisheye else cv2.projectPoints
     precision = np.float64 if is_fisheye else np.float32
-    corners = [view.corners_m[None].astype(precision) for view in views]
-    pixels = [view.pixels[None].astype(precision) for view in views]
     start = (np.zeros((3, 3)), np.zeros((4, 1))) if is_fisheye else (None, None)
-    _, K, distortion, turns, places = calibrate(
-        corners, pixels, (width, height), *start, flags=flags
+
+    def solved(used: list[View]) -> Any:
+        corners = [view.corners_m[None].astype(precision) for view in used]
+        pixels = [view.pixels[None].astype(precision) for view in used]
+        _, *found = calibrate(corners, pixels, (width, height), *start, flags=flags)
+        return found
+
+    K, distortion, turns, places = solved(views)
+    T_camera_board = se3.from_rotation_vector(
+        np.reshape(turns, (-1, 3)), np.reshape(places, (-1, 3))
     )
-    distortion = distortion.ravel()[:5]
-    count = 4 + len(distortion)
-    # where the columns of the camera and of the pose are in OpenCV's derivatives
-    of_camera, of_pose = (
-        (slice(count), slice(count, count + 6)) if is_fisheye else (slice(6, 6 + count), slice(6))
-    )
-    residuals, information = [], np.zeros((count, count))
-    T_camera_board = np.tile(np.eye(4), (len(views), 1, 1))
-    for T, view, turn, place in zip(T_camera_board, views, turns, places, strict=True):
-        T[:3, :3], T[:3, 3] = Rotation.from_rotvec(np.ravel(turn)).as_matrix(), np.ravel(place)
-        projected, J = project(view.corners_m[:, None], turn, place, K, distortion)
+    residuals = []
+    for view, turn, place in zip(views, turns, places, strict=True):
+        projected, _ = project(view.corners_m[:, None], turn, place, K, distortion)
         residuals.append(view.pixels - np.asarray(projected, np.float64).reshape(-1, 2))
-        by_pose = J[:, of_pose] @ np.linalg.lstsq(J[:, of_pose], J[:, of_camera], rcond=None)[0]
-        information += J[:, of_camera].T @ (J[:, of_camera] - by_pose)
-    freedom = sum(residual.size for residual in residuals) - count - 6 * len(views)
-    variance = sum(float((residual**2).sum()) for residual in residuals) / max(freedom, 1)
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    inverse = np.linalg.pinv(information / np.outer(scale, scale), hermitian=True) / np.outer(
-        scale, scale
-    )
-    sigma = float(np.sqrt(max(variance * inverse[:2, :2].mean(), 0.0))) / (
-        0.5 * (K[0, 0] + K[1, 1])
-    )
+    focal = []
+    for part in range(_PARTS):
+        others = [view for number, view in enumerate(views) if number % _PARTS != part]
+        focal.append(solved(others)[0][[0, 1], [0, 1]].mean())
+    sigma = float(np.sqrt(_PARTS - 1) * np.std(focal) / np.mean(focal))
+    lens = distortion.ravel()[:5]
     return Calibration(
-        model, width, height, np.asarray(K), distortion, views, residuals, T_camera_board, sigma
+        model, width, height, np.asarray(K), lens, views, residuals, T_camera_board, sigma
     )

@@ -80,9 +80,7 @@ def _open_odometry(root: OdometryRoot, name: str, asked: Path | None) -> Recorde
         T_camera_lidar=None if T_cam0_lidar is None else T_camera_cam0 @ T_cam0_lidar,
         scans=_readers(kitti.read_velodyne, folder / "velodyne", "*.bin", files),
         depth_maps=_readers(read_depth_map, folder / f"depth_{number}", "*.png", files),
-        distance_to_surface=None
-        if simulated is None
-        else _distance_to_mesh(root.base / "mesh.ply"),
+        distance_to_surface=_distance_to_mesh(root.base / "mesh.ply"),
     )
 
 

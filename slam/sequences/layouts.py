@@ -24,7 +24,7 @@ from erfsfm.common.readers.images import first_size, has_images, list_images, re
 from erfsfm.common.readers.kitti import read_velodyne
 from erfsfm.common.readers.numbering import NumberedFiles, by_name, by_table
 from slam.formats.rows import BadRows, in_seconds, number_or_nan, rows_of
-from slam.formats.trajectory import nearest_stamps, read_trajectory
+from slam.formats.trajectory import nearest_pairs, read_trajectory
 from slam.geometry import se3
 from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray
@@ -219,11 +219,11 @@ def _open_tum(folder: Path, asked: Path | None) -> RecordedSequence:
     places, match = (folder, folder.parent), _FREIBURG.search(folder.name)
     is_published = match is not None and beside(*places) is None
     own = partial(_freiburg_camera, match["camera"]) if match is not None and is_published else None
-    depth_maps = {}
+    depth_maps: dict[int, ArrayReader] = {}
     if (folder / _TUM_DEPTH).exists():
         known, paths = _index(folder / _TUM_DEPTH, folder)
-        near = _near(stamps, known, _NEAR_DEPTH_S)
-        depth_maps = {k: partial(read_depth_map, paths[row], _TUM_PER_METRE) for k, row in near}
+        for k, row in zip(*nearest_pairs(stamps, known, _NEAR_DEPTH_S)):
+            depth_maps[int(k)] = partial(read_depth_map, paths[row], _TUM_PER_METRE)
     truth = _truth(folder / "groundtruth.txt", stamps)
     return _recorded(
         "tum",
@@ -236,13 +236,6 @@ def _open_tum(folder: Path, asked: Path | None) -> RecordedSequence:
         T_any_camera=truth,
         depth_maps=depth_maps,
     )
-
-
-def _near(stamps: FloatArray, known: FloatArray, within_s: float) -> list[tuple[int, int]]:
-    """Frames, each with the nearest row of others if that is within so many seconds."""
-    nearest = nearest_stamps(stamps, known)
-    frames = np.flatnonzero(np.abs(known[nearest] - stamps) <= within_s)
-    return list(zip(frames.tolist(), nearest[frames].tolist(), strict=True))
 
 
 # TUM mono: images/, times.txt and camera.txt with the FOV lens; true poses of the start and the end alone
@@ -359,10 +352,10 @@ def _open_nuscenes(root: Path, tables: Path, scene: str, asked: Path | None) -> 
         if lidar:
             (T_ego_lidar,) = _nuscenes_poses([mounts[lidar[0]["calibrated_sensor_token"]]])
             T_camera_lidar = se3.invert(T_ego_camera) @ T_ego_lidar
-            for k, row in _near(stamps, _times(lidar), _NEAR_S):
+            for k, row in zip(*nearest_pairs(stamps, _times(lidar), _NEAR_S)):
                 path = root / lidar[row]["filename"]
                 if path.exists():
-                    scans[k] = partial(read_velodyne, path, 5)
+                    scans[int(k)] = partial(read_velodyne, path, 5)
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise SequenceError(
             f"the tables in {tables} are not those of nuScenes: {error!r}; copy them again"

@@ -130,21 +130,17 @@ def pose_files(paths: list[Path], stamps: FloatArray) -> FloatArray | None:
     Raises:
         SequenceError: a file does not hold 16 numbers, or no pose.
     """
-    there = [
-        (stamp, path, read_matrix(path, "a pose"))
-        for stamp, path in zip(stamps, paths)
-        if path.exists()
-    ]
+    if not any(path.exists() for path in paths):
+        return None
     known, poses = [], []
-    for stamp, path, pose in there:
+    for stamp, path in zip(stamps, paths):
+        pose = read_matrix(path, "a pose") if path.exists() else np.full((4, 4), np.nan)
         if not np.isfinite(pose).all():
             continue
         if not se3.is_se3(pose, _ROTATION_TOLERANCE):
             raise SequenceError(f"{path} holds no pose: its 3 x 3 part is not a rotation")
         known.append(stamp)
         poses.append(se3.rigid(pose))
-    if not there:
-        return None
     return poses_near(np.array(poses).reshape(-1, 4, 4), np.array(known), stamps, paths[0].parent)
 
 

@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterator
 from contextlib import closing
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -61,36 +60,25 @@ class StampedMessages:
 
     def __init__(self, bag: Bag, topic: str) -> None:
         self._bag, self.topic = bag, topic
-        self._times_ns = []
+        self._times_ns: list[int] = []
         stamps_ns = []
         for time_ns, data in bag.raw(topic):
             self._times_ns.append(time_ns)
-            stamps_ns.append(bag.stamp_ns(data))
-        if not stamps_ns:
-            raise SequenceError(f"topic {topic} of {bag.path} has no messages")
-        if not any(stamps_ns):
-            stamps_ns = self._times_ns
-        numbers = sorted(range(len(stamps_ns)), key=stamps_ns.__getitem__)
-        if max(abs(number - place) for place, number in enumerate(numbers)) > _MOST_OUT_OF_PLACE:
-            steps = np.diff(stamps_ns)
+            stamps_ns.append(bag.stamp_ns(topic, data))
+        stamps = _seconds(stamps_ns if any(stamps_ns) else self._times_ns)
+        numbers = np.arange(len(stamps))
+        if (np.abs(np.argsort(stamps, kind="stable") - numbers) > _MOST_OUT_OF_PLACE).any():
+            steps = np.diff(stamps)
             logger.warning(
                 "%s: the stamps of its headers go back by %.2f s at message %d: the times of recording are used",
                 topic,
-                -steps.min() / _NANOSECONDS,
+                -steps.min(),
                 int(steps.argmin()) + 1,
             )
-            stamps_ns = self._times_ns
-            numbers = list(range(len(stamps_ns)))
-        self._numbers = numbers[:1]
-        for before, number in pairwise(numbers):
-            if stamps_ns[number] > stamps_ns[before]:
-                self._numbers.append(number)
-        repeated = len(numbers) - len(self._numbers)
-        if repeated:
-            logger.warning("%s: %d messages repeat a stamp: left out", topic, repeated)
-        self.stamps: FloatArray = np.array(
-            [stamps_ns[number] / _NANOSECONDS for number in self._numbers]
-        )
+            stamps = _seconds(self._times_ns)
+        rows = BadRows(f"topic {topic} of {bag.path}", SequenceError)
+        order = rows.in_order(stamps, "stamps", numbers + 1, "messages")
+        self._numbers, self.stamps = order.tolist(), stamps[order]
         self._next = 0
         self._following: Iterator[tuple[int, bytes]] = iter(())
 
@@ -122,6 +110,10 @@ class StampedMessages:
     def points(self, index: int, where: str) -> FloatArray:
         """The points ``(P, 3)`` of a cloud, metres; ``where`` names it in errors."""
         return bags.points_of(self.read(index), where)
+
+
+def _seconds(nanoseconds: list[int]) -> FloatArray:
+    return np.array([each / _NANOSECONDS for each in nanoseconds])
 
 
 def images_of(messages: StampedMessages, where: str) -> ReadImages:

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d, map_coordinates
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial.transform import Rotation
 
 from slam.geometry import se3
 from slam.simulation.geometry import FloatArray, IntArray
@@ -28,6 +29,9 @@ _STRIDE_M = 0.72
 _SETTLED_S = 0.15  # over which turns and starts are smoothed
 _CARRIER_CLEAR_M = 0.4  # of the carrier in the plan, where nothing is swayed any further
 
+# its carrier looks along x, with y to the left and z up
+R_CARRIER_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
 
 class Floor:
     """The free floor of a house.
@@ -39,37 +43,33 @@ class Floor:
 
     def __init__(self, interior: Interior, seed: int) -> None:
         """Find what is free, and places in every room that can be reached."""
-        house = interior.house
-        areas = np.array([room.area for room in house.rooms])
+        areas = np.array([room.area for room in interior.rooms])
         self._origin = areas[:, :2].min(axis=0) - 0.5
-        shape = np.ceil((areas[:, 2:].max(axis=0) + 0.5 - self._origin) / CELL).astype(int)
-        free = np.zeros((shape[1], shape[0]), dtype=np.uint8)
-        for rectangles, value in (([*map(tuple, areas), *house.doors], 1), (interior.obstacles, 0)):
-            for x0, y0, x1, y1 in rectangles:
-                low, high = (
-                    (np.array(corner) - self._origin) / CELL for corner in ((x0, y0), (x1, y1))
-                )
-                outwards = 0.0 if value else 1.0
-                first = np.ceil(low - 0.5 - 0.5 * outwards).astype(int)
-                last = np.floor(high + 0.5 + 0.5 * outwards).astype(int)
-                free[first[1] : last[1], first[0] : last[0]] = value
+        columns, rows = np.ceil((areas[:, 2:].max(axis=0) + 0.5 - self._origin) / CELL).astype(int)
+        free = np.zeros((rows, columns), dtype=np.uint8)
+        for rectangles, value in (([*areas, *interior.doors], 1), (interior.obstacles, 0)):
+            for rectangle in rectangles:
+                corners = (np.reshape(rectangle, (2, 2)) - self._origin) / CELL
+                (left, low), (right, high) = np.rint(corners).astype(int)
+                free[low:high, left:right] = value
         self._clearance = np.asarray(
             cv2.distanceTransform(free, cv2.DIST_L2, 5) * CELL, dtype=np.float64
         )
-        self._cells = np.argwhere(self._clearance >= _CLEAR_M)[:, ::-1]  # (C, 2), column and row
+        # of each cell of the floor, (C, 2)
+        self._centres = self._origin + CELL * (0.5 + np.argwhere(free >= 0)[:, ::-1])
         self._graph = self._connect()
         rng = np.random.default_rng([seed, 52])
         _, part = connected_components(self._graph, directed=False)
-        centres = self._centres(self._cells)
-        roomy = (part == np.bincount(part).argmax()) & (self.clearance(centres) >= _PLACE_CLEAR_M)
+        roomy = self._clearance.ravel() >= _PLACE_CLEAR_M
+        roomy &= part == np.bincount(part).argmax()
         chosen: list[int] = []
         rooms: list[int] = []
-        for number, room in enumerate(house.rooms):  # up to five places a room
-            inside = np.flatnonzero(roomy & room.contains(centres))
+        for number, room in enumerate(interior.rooms):  # up to five places a room
+            inside = np.flatnonzero(roomy & room.contains(self._centres))
             found = rng.choice(inside, min(len(inside), 5), replace=False)
             chosen.extend(found)
             rooms.extend([number] * len(found))
-        self.places = centres[chosen]
+        self.places = self._centres[chosen]
         self.room = np.array(rooms)
         self._at = np.array(chosen)
 
@@ -81,11 +81,10 @@ class Floor:
     def path(self, start: int, end: int) -> FloatArray:
         """A walk between two places, a point every ``CELL`` or so, ``(M, 2)``."""
         _, before = self._from(start)
-        cells, at = [self._at[end]], int(self._at[end])
-        while at != self._at[start]:
-            at = int(before[at])
-            cells.append(at)
-        walk = self._centres(self._cells[cells[::-1]])
+        cells = [self._at[end]]
+        while cells[-1] != self._at[start]:
+            cells.append(before[cells[-1]])
+        walk = self._centres[cells[::-1]]
         for corner_m in _CORNERS_M:
             rounded = gaussian_filter1d(walk, corner_m / CELL, axis=0, mode="nearest")
             rounded[[0, -1]] = walk[[0, -1]]
@@ -97,25 +96,20 @@ class Floor:
         """How far every place is from one of them, ``(P,)``."""
         return self._from(start)[0][self._at]
 
-    def _centres(self, cells: IntArray) -> FloatArray:
-        return self._origin + (cells + 0.5) * CELL
-
     def _connect(self) -> coo_array:
         """Neighbouring cells, farther apart the nearer they are to walls."""
-        number = np.full(self._clearance.shape, -1)
-        number[self._cells[:, 1], self._cells[:, 0]] = np.arange(len(self._cells))
+        number = np.arange(self._clearance.size).reshape(self._clearance.shape)
+        is_clear = self._clearance >= _CLEAR_M
+        length = CELL * (1.0 + 0.15 / np.maximum(self._clearance, CELL) ** 2)
         starts, ends, lengths = [], [], []
-        for step in ((1, 0), (0, 1), (1, 1), (1, -1)):
-            there = self._cells + step
-            inside = (there >= 0).all(axis=1) & (there < number.T.shape).all(axis=1)
-            other = np.where(inside, number[there[:, 1] * inside, there[:, 0] * inside], -1)
-            here = np.flatnonzero(other >= 0)
-            near = self._clearance[self._cells[here, 1], self._cells[here, 0]]
-            starts.append(here)
-            ends.append(other[here])
-            lengths.append(CELL * np.hypot(*step) * (1.0 + 0.15 / near**2))
-        joined = np.concatenate(lengths), (np.concatenate(starts), np.concatenate(ends))
-        return coo_array(joined, shape=(len(self._cells),) * 2).tocsr()
+        for step in ((0, 1), (1, 0), (1, 1), (1, -1)):
+            # nothing is clear at the edge, where rows and columns go round
+            joined = is_clear & np.roll(is_clear, step, axis=(0, 1))
+            starts.append(number[joined])
+            ends.append(np.roll(number, step, axis=(0, 1))[joined])
+            lengths.append(np.hypot(*step) * length[joined])
+        table = np.concatenate(lengths), (np.concatenate(starts), np.concatenate(ends))
+        return coo_array(table, shape=(number.size,) * 2).tocsr()
 
     @functools.lru_cache(maxsize=64)  # noqa: B019 - a floor lives as long as its world
     def _from(self, start: int) -> tuple[FloatArray, IntArray]:
@@ -159,8 +153,8 @@ GAITS: dict[str, Gait] = {
 class Carried:
     """A motion, ``CLOCK`` samples a second.
 
-    Its channels ``(M, 6)`` are x, y, z in metres, yaw to the left from east, pitch upwards and roll
-    in radians.
+    Its channels ``(M, 6)`` are x, y, z in metres, yaw to the left from east, pitch downwards and
+    roll in radians.
     """
 
     def __init__(self, floor: Floor, motion: str, seconds: float, rate: float, seed: int) -> None:
@@ -181,59 +175,35 @@ class Carried:
         x, y, yaw, pitch, moved = base.T
         step = np.cumsum(moved * gait.speed / CLOCK) / _STRIDE_M * 2.0 * np.pi
         free = np.clip(floor.clearance(base[:, :2]) - _CARRIER_CLEAR_M, 0.0, 1.0)
-        side = moved * gait.sway_m * np.sin(0.5 * step) + gait.sway_m * _unrest(rng, count, 0.6)
-        side = np.clip(side, -free, free)
-        unsteady = np.deg2rad(gait.tremor_deg)
-        wander = np.deg2rad(gait.wander_deg) * (0.3 + 0.7 * moved)
-        tremors = [
-            unsteady * (_unrest(rng, count, 0.05) + 0.7 * _unrest(rng, count, 0.25))
-            for _ in range(3)
-        ]
-        height = rng.uniform(*gait.height_m) + gait.climb_m * _unrest(rng, count, 1.5)
+        sways, climbs, turns, nods, rolls = _unrest(rng, (5, count), 0.9)
+        tremors = _unrest(rng, (3, count), 0.05) + 0.7 * _unrest(rng, (3, count), 0.25)
+        side = np.clip(gait.sway_m * (moved * np.sin(0.5 * step) + sways), -free, free)
+        height = rng.uniform(*gait.height_m) + gait.climb_m * climbs
         z = height + moved * gait.bob_m * np.cos(step)
-        yaw = yaw + wander * _unrest(rng, count, 0.9) + tremors[0]
-        pitch = (
-            pitch
-            + np.deg2rad(gait.pitch_deg)
-            + wander / 3.0 * _unrest(rng, count, 0.9)
-            + tremors[1]
-        )
-        roll = (
-            np.deg2rad(gait.roll_deg) * _unrest(rng, count, 0.8)
-            + 0.3 * moved * gait.sway_m * np.cos(0.5 * step)
-            + tremors[2]
-        )
-        self._channels = np.stack(
-            [x + side * np.sin(yaw), y - side * np.cos(yaw), z, yaw, pitch, roll], axis=1
-        )
+        wander = np.deg2rad(gait.wander_deg) * (0.3 + 0.7 * moved)
+        yaw = yaw + wander * turns
+        pitch = pitch + np.deg2rad(gait.pitch_deg) + wander / 3.0 * nods
+        swing = 0.3 * moved * gait.sway_m * np.cos(0.5 * step)
+        roll = np.deg2rad(gait.roll_deg) * rolls + swing
+        angles = np.stack([yaw, -pitch, roll]) + np.deg2rad(gait.tremor_deg) * tremors
+        self._channels = np.vstack([x + side * np.sin(yaw), y - side * np.cos(yaw), z, angles]).T
 
     def at(self, seconds: FloatArray) -> FloatArray:
-        """The channels at times ``(N,)``, ``(6, N)``."""
+        """The channels at times ``(N,)``, ``(N, 6)``; its ends are held."""
         clock = np.arange(len(self._channels)) / CLOCK
-        return np.stack([np.interp(seconds, clock, channel) for channel in self._channels.T])
+        return se3.interpolated(seconds, clock, self._channels)
 
     def poses(self, seconds: FloatArray) -> FloatArray:
         """``T_scene_camera`` at times ``(N,)``, ``(N, 4, 4)``."""
-        x, y, z, yaw, pitch, roll = self.at(seconds)
-        level, zero = np.cos(pitch), np.zeros_like(x)
-        forward = np.stack([np.cos(yaw) * level, np.sin(yaw) * level, np.sin(pitch)], axis=1)
-        right = np.stack([np.sin(yaw), -np.cos(yaw), zero], axis=1)
-        upright = se3.make(
-            np.stack([right, np.cross(forward, right), forward], axis=2),
-            np.stack([x, y, z], axis=1),
-        )
-        return upright @ se3.from_rotation_vector(
-            np.stack([zero, zero, roll], axis=1), np.zeros((len(x), 3))
-        )
+        channels = self.at(seconds)
+        R_scene_carrier = Rotation.from_euler("ZYX", channels[:, 3:]).as_matrix()
+        return se3.make(R_scene_carrier @ R_CARRIER_CAMERA, channels[:, :3])
 
 
-def _unrest(rng: np.random.Generator, count: int, seconds: float) -> FloatArray:
-    """Noise of unit deviation within two and a half that is smooth over a time, ``(count,)``."""
+def _unrest(rng: np.random.Generator, shape: tuple[int, int], seconds: float) -> FloatArray:
+    """Noise of unit deviation within two and a half, smooth over a time along the last axis."""
     sigma = seconds * CLOCK
-    margin = int(4.0 * sigma)
-    noise = gaussian_filter1d(rng.standard_normal(count + 2 * margin), sigma)[
-        margin : margin + count
-    ]
+    noise = gaussian_filter1d(rng.standard_normal(shape), sigma, mode="wrap")
     return np.clip(noise * np.sqrt(3.54 * sigma), -2.5, 2.5)
 
 
@@ -247,7 +217,7 @@ class _Walk:
         self._rng = rng
         self._visits = np.zeros(int(floor.room.max()) + 1)
         self._place = int(rng.integers(len(floor.places)))
-        self._yaw = float(rng.uniform(-np.pi, np.pi))
+        self._yaw = rng.uniform(-np.pi, np.pi)
         self._parts: list[FloatArray] = []
 
     def over(self, ticks: int) -> FloatArray:
@@ -274,35 +244,28 @@ class _Walk:
         path = floor.path(self._place, goal)
         length = se3.distance_along(path)
         along = np.linspace(0.0, length[-1], max(int(length[-1] / 0.02), 8))
-        path = np.stack([np.interp(along, length, axis) for axis in path.T], axis=1)
-        rows = np.arange(len(path))
-        ahead = np.minimum(rows + 25, rows[-1])
-        behind = np.minimum(rows, max(len(path) - 26, 0))
-        towards = path[ahead] - path[behind]
-        heading = np.unwrap(np.arctan2(towards[:, 1], towards[:, 0]))
-        self._turn_by(float((heading[0] - self._yaw + np.pi) % (2.0 * np.pi) - np.pi))
+        path = se3.interpolated(along, length, path)
+        ahead = np.gradient(gaussian_filter1d(path, 12.0, axis=0, mode="nearest"), axis=0)
+        heading = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
+        self._turn_by((heading[0] - self._yaw + np.pi) % (2.0 * np.pi) - np.pi)
         heading += self._yaw - heading[0]
-        pace = np.minimum(np.minimum(along, along[-1] - along) + 0.15, 0.5) / 0.5 * self._gait.speed
-        walking, turning = np.diff(along) / pace[1:], np.abs(np.diff(heading)) / (0.8 * self._turn)
+        pace = np.minimum(np.minimum(along, along[-1] - along) + 0.15, 0.5) / 0.5
+        walking = np.diff(along) / (pace[1:] * self._gait.speed)
+        turning = np.abs(np.diff(heading)) / (0.8 * self._turn)
         arrival = np.concatenate([[0.0], np.cumsum(np.maximum(walking, turning))])
         ticks = np.arange(1, int(arrival[-1] * CLOCK) + 1) / CLOCK
-        at = np.interp(ticks, arrival, rows)
-        channels = *path.T, heading, pace
-        x, y, yaw, walked = (np.interp(at, rows, channel) for channel in channels)
-        level = np.zeros_like(at)
-        self._parts.append(np.stack([x, y, yaw, level, walked / self._gait.speed], axis=1))
+        channels = np.column_stack([path, heading, np.zeros_like(pace), pace])
+        self._parts.append(se3.interpolated(ticks, arrival, channels))
         self._yaw, self._place = float(heading[-1]), goal
 
     def _look_round(self) -> None:
         """Turn on the spot."""
-        self._turn_by(
-            float(self._rng.choice([-1.0, 1.0]) * np.deg2rad(self._rng.uniform(60.0, 360.0)))
-        )
+        self._turn_by(self._rng.choice([-1.0, 1.0]) * np.deg2rad(self._rng.uniform(60.0, 360.0)))
 
     def _sweep(self) -> None:
         """Look left and right, up and down."""
         wide, high = np.deg2rad(self._rng.uniform((20.0, 8.0), (45.0, 25.0)))
-        seconds = max(float(self._rng.uniform(3.0, 5.0)), 2.0 * np.pi * wide / self._turn)
+        seconds = max(self._rng.uniform(3.0, 5.0), 2.0 * np.pi * wide / self._turn)
         phase = np.linspace(0.0, 2.0 * np.pi, int(seconds * CLOCK))
         self._stay(self._yaw + wide * np.sin(phase), high * np.sin(2.0 * phase))
 
@@ -316,6 +279,5 @@ class _Walk:
         self._yaw += angle
 
     def _stay(self, yaw: FloatArray, pitch: FloatArray) -> None:
-        x, y = self._parts[-1][-1, :2] if self._parts else self._floor.places[self._place]
-        x, y, still = (np.full_like(yaw, value) for value in (x, y, 0.0))
-        self._parts.append(np.stack([x, y, yaw, pitch, still], axis=1))
+        place = np.tile(self._floor.places[self._place], (len(yaw), 1))
+        self._parts.append(np.column_stack([place, yaw, pitch, np.zeros_like(yaw)]))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.simulation.furniture import STANDING, TALL, Piece, dining
-from slam.simulation.geometry import FLAT, FloatArray, luck
+from slam.simulation.geometry import FLAT, FloatArray, luck, unit
 from slam.simulation.shapes import UP, Rectangle, Site, lattice
 
 WALL = 0.14  # thickness, metres
@@ -20,6 +20,7 @@ KINDS = ("living", "kitchen", "office", "bedroom", "bath", "office")
 DOOR_HEIGHT = 2.1
 _AISLE = 1.0  # left free between the furniture at the walls and the table in the middle, metres
 _DEEPEST = 0.65  # piece at a wall, metres
+_TOUCHES = 1e-6  # metres
 _STEP = 0.5  # between the vertices of walls, which carry the light, metres
 
 
@@ -37,40 +38,9 @@ class Room:
         x0, y0, x1, y1 = self.area
         return np.asarray(((points > (x0, y0)) & (points < (x1, y1))).all(axis=1))
 
-    def side(self, number: int) -> tuple[tuple[float, float], float, float]:
-        """Where a wall begins, counterclockwise, its direction as an angle, and its length."""
-        x0, y0, x1, y1 = self.area
-        corner = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))[number]
-        return corner, number * np.pi / 2.0, x1 - x0 if number % 2 == 0 else y1 - y0
 
-
-@dataclass(frozen=True)
-class House:
-    """Rooms, and doorways as the rectangles of the walls that they cut."""
-
-    rooms: list[Room]
-    doors: list[Rectangle]
-
-    def openings(self, room: Room, number: int) -> list[tuple[float, float]]:
-        """Where the doors in a wall of a room begin and end along it, in order."""
-        x0, y0, x1, y1 = room.area
-        found = []
-        for left, low, right, high in self.doors:
-            spans = (
-                (left - x0, right - x0),
-                (low - y0, high - y0),
-                (x1 - right, x1 - left),
-                (y1 - high, y1 - low),
-            )
-            touches = (high == y0, left == x1, low == y1, right == x0)[number]
-            along = spans[number]
-            if touches and along[0] > 0.0 and along[1] < room.side(number)[2]:
-                found.append(along)
-        return sorted(found)
-
-
-def draw_house(seed: int) -> House:
-    """The plan of a world."""
+def draw_plan(seed: int) -> tuple[list[Room], list[Rectangle]]:
+    """The rooms of a house, and its doorways as the rectangles of the walls that they cut."""
     rng = luck(seed, 50)
     length, width, height = rng.uniform((14.0, 1.9, 2.45), (20.0, 2.4, 2.9)).tolist()
     corridor = Room("corridor", (0.0, 0.0, length, width), height, (3,))
@@ -82,28 +52,29 @@ def draw_house(seed: int) -> House:
     kinds = list(rng.permutation(KINDS)) + list(rng.permutation(KINDS))
     for north in (False, True):
         start, before = 0.0, None
+        wall = width if north else -WALL  # of the corridor, its southern side
         while length - start > 3.2:
             end = start + rng.uniform(3.4, 6.0)
             end = length if length - end < 3.4 + WALL else end
             depth = rng.uniform(3.4, 5.5)
-            low, high = (width + WALL, width + WALL + depth) if north else (-WALL - depth, -WALL)
+            low = wall + WALL if north else wall - depth
             kind, outside = str(kinds.pop()), (2,) if north else (0,)
-            rooms.append(Room(kind, (start, low, end, high), height, outside))
+            rooms.append(Room(kind, (start, low, end, low + depth), height, outside))
             door = start + rng.uniform(0.75, end - start - 1.85)
-            wall = (width, low) if north else (high, 0.0)
-            doors.append((door, wall[0], door + rng.uniform(0.95, 1.1), wall[1]))
+            doors.append((door, wall, door + rng.uniform(0.95, 1.1), wall + WALL))
             if before is not None and rng.random() < 0.5:
-                middle = width + WALL + 1.2 if north else -WALL - 2.2
+                middle = low + 1.2 if north else wall - 2.2
                 doors.append((before, middle, start, middle + 1.0))
             before, start = end, end + WALL
-    return House(rooms, doors)
+    return rooms, doors
 
 
 class Interior:
     """A furnished house: its walls, furniture and lamps.
 
     Attributes:
-        house: its plan.
+        rooms: between their walls.
+        doors: doorways as the rectangles of the walls that they cut.
         mesh: all surfaces.
         obstacles: what stands on the floors, in plan.
         lights: position and strength of lamps and windows, ``(L, 4)``.
@@ -112,14 +83,15 @@ class Interior:
     def __init__(self, seed: int) -> None:
         """The house of a world."""
         self.rng = rng = luck(seed, 51)
-        self.house, self.site = draw_house(seed), Site(rng)
+        self.site = Site(rng)
+        self.rooms, self.doors = draw_plan(seed)
         self.obstacles: list[Rectangle] = []
         self._lights: list[tuple[float, float, float, float]] = []
         self.frame_look = self.site.instance("wood", "wood")
         self.skirting = self.site.colour("skirting")
-        for room in self.house.rooms:
+        for room in self.rooms:
             self._enclose_and_fill(room)
-        for door in self.house.doors:
+        for door in self.doors:
             self._doorway(door)
         self.mesh, self.lights = self.site.finish(FLAT), np.array(self._lights)
 
@@ -151,34 +123,30 @@ class Interior:
 
     def _doorway(self, door: Rectangle) -> None:
         """Jambs, lintel and threshold of an opening."""
-        x0, y0, x1, y1 = door
-        east = np.array([x1 - x0, 0, 0])
-        north = np.array([0, y1 - y0, 0])
-        up = DOOR_HEIGHT * UP
-        corner = np.array([x0, y0, 0.0])
-        if x1 - x0 > WALL + 0.01:
-            jambs = (corner, north), (corner + east + north, -north)
-        else:
-            jambs = (corner + east, -east), (corner + north, east)
-        lintel, threshold = (corner + up, north, east), (corner, east, north)
-        for quad in (*((foot, along, up) for foot, along in jambs), lintel, threshold):
-            self.site.quad(*quad, self.frame_look)
+        is_wide = door[2] - door[0] > WALL + _TOUCHES
+        place, width = self.site.side(door, 0 if is_wide else 1)
+        corner, up = place.origin, DOOR_HEIGHT * UP
+        along, through = width * place.frame[0], WALL * place.frame[1]
+        self.site.quad(corner, through, up, self.frame_look)
+        self.site.quad(corner + along + through, -through, up, self.frame_look)
+        self.site.quad(corner + up, through, along, self.frame_look)
+        self.site.quad(corner, along, through, self.frame_look)
 
     def _panel(self, corner: FloatArray, along: FloatArray, up: FloatArray, look: int) -> None:
         """A parallelogram, vertices at most ``_STEP`` apart, textured in metres from its corner."""
-        width, height = float(np.linalg.norm(along)), float(np.linalg.norm(up))
-        a, b = (
-            np.linspace(0.0, 1.0, int(np.ceil(extent / _STEP)) + 1) for extent in (width, height)
-        )
-        points = corner + a[None, :, None] * along + b[:, None, None] * up
-        uv = lattice(a * width, b * height + corner[2] * (up[2] > 0.0))
-        self.site.patch(points, uv, look)
+        sides = np.stack([along, up])
+        ticks = [
+            np.linspace(0.0, extent, int(np.ceil(extent / _STEP)) + 1)
+            for extent in np.linalg.norm(sides, axis=1)
+        ]
+        at = lattice(*ticks)
+        uv = at + np.array([0.0, corner[2] * (up[2] > 0.0)])
+        self.site.patch(corner + at @ unit(sides), uv, look)
 
     def _furnish(self, room: Room, number: int, wall: int) -> None:
         """One wall around its doors, seen from inside, with windows, furniture and pictures."""
-        rng, openings = self.rng, self.house.openings(room, number)
-        (x, y), angle, length = room.side(number)
-        foot = self.site.at(x, y, angle)
+        rng, (foot, length) = self.rng, self.site.side(room.area, number)
+        openings = self._openings(foot, length)
         for k, (start, end) in enumerate(pairwise([0.0, *np.ravel(openings), length])):
             low = DOOR_HEIGHT * (k % 2)
             corner = foot.moved(end, up=low).origin
@@ -206,46 +174,48 @@ class Interior:
                 self._hang(place, width)
             left += width + rng.uniform(0.05, 0.5)
 
+    def _openings(self, wall: Site, length: float) -> list[tuple[float, float]]:
+        """Where the doors in a wall begin and end along it, in order."""
+        found = []
+        for door in self.doors:
+            corners = (np.reshape(door, (2, 2)) - wall.origin[:2]) @ wall.frame[:2, :2].T
+            (start, end), (_, inwards) = np.sort(corners, axis=0).T
+            if abs(inwards) < _TOUCHES and start > 0.0 and end < length:
+                found.append((start, end))
+        return sorted(found)
+
     def _place(self, piece: Piece, place: Site, width: float) -> None:
         depth = piece(place, width)
-        corners = np.stack([place.origin, place.moved(width).moved(0.0, depth).origin])
+        corners = np.stack([place.origin, place.moved(width, depth).origin])
         self.obstacles.append((*corners.min(axis=0)[:2], *corners.max(axis=0)[:2]))
 
     def _hang(self, place: Site, width: float) -> None:
-        """A picture, a poster, a mirror or a screen at the height of the eyes."""
+        """A picture or a mirror at the height of the eyes."""
         rng = self.rng
-        across, high = rng.uniform(0.4, min(width, 1.2)), rng.uniform(0.4, 0.8)
-        first, second = place.colour("paint"), place.colour("cloth")
-        kind = rng.random()
-        if kind < 0.75:
-            size = across, high, float(rng.integers(3))
-            look = place.instance("picture", first, second, size)
-        elif kind < 0.9:
-            look = place.instance("screen", first, second, (across, high))
+        size = rng.uniform(0.4, min(width, 1.2)), rng.uniform(0.4, 0.8)
+        if rng.random() < 0.8:
+            look = place.instance("picture", "paint", "cloth", size)
         else:
-            mirror = (0.72, 0.76, 0.78)
-            look = place.instance("pane", mirror, self.skirting, (across, high))
-        left = rng.uniform(0.0, width - across)
-        low = (left, 0.0, 1.6 - 0.5 * high + rng.uniform(-0.1, 0.15))
-        place.plate(low, (across, 0.02, high), look, self.frame_look)
+            look = place.instance("pane", (0.72, 0.76, 0.78), self.skirting, size)
+        low = (rng.uniform(0.0, width - size[0]), 0.0, rng.uniform(1.5, 1.75) - 0.5 * size[1])
+        place.plate(low, (size[0], 0.02, size[1]), look, self.frame_look)
 
     def _windows(self, room: Room, number: int) -> list[tuple[float, float]]:
         """Panes in an outside wall, which light the room; where they begin and end along it."""
         if number not in room.outside:
             return []
         rng = self.rng
-        (x, y), angle, length = room.side(number)
+        place, length = self.site.side(room.area, number)
         low, high = (1.6, 1.6) if room.kind == "hall" else (0.95, 1.2)
         width = min(rng.uniform(1.0, 1.7), length - 0.4)
         spans, left = [], rng.uniform(0.2, 0.9)
-        place = self.site.at(x, y, angle)
         while left + width < length - 0.1:
             sky = np.array([0.86, 0.92, 0.98]) * rng.uniform(0.9, 1.05)
             pane = place.instance("pane", sky, self.skirting, (width, high, 1.0))
             place.plate((left, 0.0, low), (width, 0.01, high), pane, self.frame_look)
-            x_light, y_light, _ = place.moved(left + 0.5 * width).moved(0.0, 0.8).origin
+            light = place.moved(left + 0.5 * width, 0.8, low + 0.6 * high).origin
             strength = (0.35 if room.kind == "hall" else 0.7) * width * high
-            self._lights.append((x_light, y_light, low + 0.6 * high, strength))
+            self._lights.append((*light, strength))
             spans.append((left, left + width))
             left += width + rng.uniform(0.5, 2.5)
         return spans
@@ -262,7 +232,7 @@ class Interior:
                 while left < high[0] - 1.0:
                     piece, width = STANDING["hall"][rng.integers(3)]
                     width = min(width, high[0] - left)
-                    self._place(piece, self.site.at(left, y), width)
+                    self._place(piece, self.site.moved(left, y), width)
                     left += width + rng.choice([0.05, 1.3], p=[0.6, 0.4])
             return
         if room.kind in ("living", "bedroom", "office") and free.min() > 0.2:
@@ -275,7 +245,7 @@ class Interior:
         if free[0] > 0.8 and free[1] > 1.2 and rng.random() < 0.8:
             width, depth = min(free[0], 1.8), min(free[1] - 0.6, 0.9)
             x, y = low + 0.5 * (free - np.array([width, depth]))
-            dining(self.site.at(x, y), width, depth)
+            dining(self.site.moved(x, y), width, depth)
             self.obstacles.append((x, y - 0.3, x + width, y + depth + 0.3))
 
     def _lamps(self, room: Room) -> None:
@@ -283,12 +253,17 @@ class Interior:
         rng, (x0, y0, x1, y1) = self.rng, room.area
         bulb = self.site.instance("lamp", (1.0, 0.98, 0.92))
         strength = (0.8 if room.kind == "hall" else 1.0) * rng.uniform(0.8, 1.2)
-        across, along = (max(1, round(extent / 3.4)) for extent in (x1 - x0, y1 - y0))
-        for x in x0 + (np.arange(across) + 0.5) / across * (x1 - x0):
-            for y in y0 + (np.arange(along) + 0.5) / along * (y1 - y0):
-                lamp = self.site.at(x - 0.25, y - 0.15, z=room.height - 0.06)
-                lamp.solid((0, 0, 0.001), (0.5, 0.3, 0.05), bulb)
+        for x in _middles(x0, x1):
+            for y in _middles(y0, y1):
+                lamp = self.site.moved(x - 0.25, y - 0.15, room.height - 0.06)
+                lamp.box((0, 0, 0.001), (0.5, 0.3, 0.05), bulb)
                 self._lights.append((x, y, room.height - 0.3, strength))
+
+
+def _middles(low: float, high: float) -> list[float]:
+    """Of the equal parts of a stretch, of about 3.4 m."""
+    count = max(1, round((high - low) / 3.4))
+    return (low + (np.arange(count) + 0.5) / count * (high - low)).tolist()
 
 
 # which several motions and hazards share

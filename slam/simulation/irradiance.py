@@ -26,8 +26,8 @@ def irradiance_of(seed: int, some_are_dim: bool) -> Float32Array:
     interior = interior_of(seed)
     lights = interior.lights.copy()
     if some_are_dim:
-        strength = np.exp(luck(seed, 54).uniform(-1.5, 0.5, len(interior.house.rooms)))
-        for room, factor in zip(interior.house.rooms, strength):
+        strength = np.exp(luck(seed, 54).uniform(-1.5, 0.5, len(interior.rooms)))
+        for room, factor in zip(interior.rooms, strength):
             lights[room.contains(lights[:, :2]), 3] *= factor
     surface, mesh = Surface(interior.mesh), interior.mesh
     triangles = mesh.triangles.astype(np.int64)
@@ -68,18 +68,13 @@ def _around(surface: Surface, points: FloatArray, normals: FloatArray) -> IntArr
 
     It is -1 where a ray meets none.
     """
-    turn = np.arange(_RAYS) * 2.39996  # the golden angle
-    radius = np.sqrt((np.arange(_RAYS) + 0.5) / _RAYS)
-    helper = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    side = np.cross(normals, helper)
-    side = unit(side)
-    other = np.cross(normals, side)
+    height = 1.0 - 2.0 * (np.arange(_RAYS) + 0.5) / _RAYS
+    turn, level = np.arange(_RAYS) * 2.39996, np.sqrt(1.0 - height * height)  # the golden angle
+    sphere = np.stack([level * np.cos(turn), level * np.sin(turn), height], axis=1)
     found = np.empty((_RAYS, len(points)), dtype=np.int64)
-    for k, (angle, r) in enumerate(zip(turn, radius)):
-        direction = (
-            r * np.cos(angle) * side + r * np.sin(angle) * other + np.sqrt(1.0 - r * r) * normals
-        )
-        answer = surface.cast(np.hstack([points, direction]).astype(np.float32))
+    for k, away in enumerate(sphere):
+        # a normal and a point of the unit sphere: as often along the cosine to the normal
+        answer = surface.cast(np.hstack([points, normals + away]).astype(np.float32))
         met = np.isfinite(answer["t_hit"])
         found[k] = np.where(met, answer["primitive_ids"].astype(np.int64), -1)
     return found

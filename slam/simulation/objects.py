@@ -1,10 +1,10 @@
 """Objects of a street: buildings, trees, hedges, fences, lamps, signs, cars and people."""
 
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 
 import numpy as np
 
-from slam.simulation.geometry import FloatArray
 from slam.simulation.shapes import UP, Site, lattice
 
 
@@ -21,39 +21,37 @@ def building(site: Site, width: float, depth: float) -> None:
     look = (floor, spacing, window_width, rng.uniform(1.1, 1.7), style, height)
     wall = site.instance("wall", plaster, trim, look)
     roof = site.instance("roof", "roof")
-    site.box(np.zeros(3), (width, depth, height), wall, roof)
+    site.box((0, 0, 0), (width, depth, height), wall, roof)
     if rng.random() < 0.65:
         _gable(site, (width, depth, height), wall, roof)
     if rng.random() < 0.4:  # a bay or porch in front
         w = rng.uniform(0.2, 0.4) * width
         x = rng.uniform(0.5, width - w - 0.5)
         top = rng.uniform(0.6, 1.0) * height if floors > 1 else 2.6
-        site.box((x, -0.9, 0.0), (x + w, 0.0, top), wall, roof)
+        site.box((x, -0.9, 0), (w, 0.9, top), wall, roof)
     if rng.random() < 0.5:  # a chimney
         x, y = rng.uniform(0.2, 0.8) * width, rng.uniform(0.3, 0.7) * depth
         stone = site.instance("wall", 0.8 * plaster, trim, (99.0, 99.0, 0.0, 0.0, 1.0, height))
-        site.box((x, y, height), (x + 0.8, y + 0.8, height + 3.0), stone)
+        site.box((x, y, height), (0.8, 0.8, 3.0), stone)
 
 
 def _gable(site: Site, size: tuple[float, float, float], wall: int, roof: int) -> None:
     """A saddle roof with eaves over a box, its ridge along the longer or the shorter side."""
     width, depth, height = size
-    axis_x, axis_y, axis_z, origin = site.frame
     if site.rng.random() < 0.35:  # ridge across
-        axis_x, axis_y, origin = axis_y, -axis_x, origin + width * axis_x
-        width, depth = depth, width
+        site, width, depth = site.moved(width, turn=np.pi / 2.0), depth, width
     rise = depth * site.rng.uniform(0.25, 0.5)
     eave = 0.4
     drop = eave * rise / (0.5 * depth)
-    left = origin - eave * axis_x - eave * axis_y + (height - drop) * axis_z
-    right = left + (depth + 2 * eave) * axis_y
-    ridge = origin - eave * axis_x + 0.5 * depth * axis_y + (height + rise) * axis_z
-    along = (width + 2 * eave) * axis_x
+    left = site.moved(-eave, -eave, height - drop).origin
+    right = site.moved(-eave, depth + eave, height - drop).origin
+    ridge = site.moved(-eave, 0.5 * depth, height + rise).origin
+    along = (width + 2 * eave) * site.frame[0]
     site.quad(left, along, ridge - left, roof)
     site.quad(right, along, ridge - right, roof)
     for end in (0.0, width):
-        a = origin + end * axis_x + height * axis_z
-        b, c = a + depth * axis_y, a + 0.5 * depth * axis_y + rise * axis_z
+        a, b = (site.moved(end, across, height).origin for across in (0.0, depth))
+        c = site.moved(end, 0.5 * depth, height + rise).origin
         uv = np.array([[[0.0, height], [depth, height]], [[0.5 * depth, height + rise]] * 2])
         site.patch(np.stack([[a, b], [c, c]]), uv, wall)
 
@@ -90,19 +88,19 @@ def hedge(site: Site, length: float) -> None:
         plain = (99.0, 99.0, 0.0, 0.0, 1.0, height)  # without windows
         look = site.instance("wall", "garden wall", 1.0, plain)
         thick = 0.3
-    site.box(np.zeros(3), (length, thick, height), look)
+    site.box((0, 0, 0), (length, thick, height), look)
 
 
-def lamp(site: Site, towards: FloatArray) -> None:
-    """A street lamp whose arm reaches ``towards`` the road, a plan direction ``(2,)``."""
+def lamp(site: Site) -> None:
+    """A street lamp whose arm reaches against the place's y axis."""
     steel = site.instance("metal", "street lamp")
     top = site.pole(site.rng.uniform(5.0, 8.0), (0.10, 0.06), steel)
-    reach = np.array([*towards, 0.12])
+    reach = 0.12 * UP - site.frame[1]
     site.tube(top, top + reach * site.rng.uniform(0.9, 1.8), (0.05, 0.09), steel)
 
 
 def sign(site: Site) -> None:
-    """A traffic sign on a post; its plate faces traffic that drives along the place's y axis."""
+    """A traffic sign on a post; its plate faces traffic that drives along the place's x axis."""
     steel = site.instance("metal", "sign post")
     height = site.rng.uniform(2.1, 2.7)
     site.pole(height + 0.3, (0.04, 0.04), steel)
@@ -110,50 +108,63 @@ def sign(site: Site) -> None:
     half = site.rng.uniform(0.3, 0.45)
     kind = float(site.rng.integers(3))
     plate = site.instance("sign", paint, (0.92, 0.92, 0.90), (half, kind))
-    site.moved(-half, -0.06, height).box(np.zeros(3), (2 * half, 0.02, 2 * half), plate)
+    site.box((-0.06, -half, height), (0.02, 2 * half, 2 * half), plate)
 
 
-def railing(site: Site, length: float) -> None:
-    """Posts and bars along the place's x axis, which one sees through."""
+def fence(site: Site, length: float) -> None:
+    """A railing, or posts and wires, along the place's x axis, which one sees through."""
     rng = site.rng
-    steel = site.instance("metal", "railing")
-    height, spacing = rng.uniform(0.6, 1.3), rng.choice([0.15, 0.3, 1.5, 2.5])
-    radii = (rng.uniform(0.015, 0.05),) * 2
-    posts = np.arange(0.0, length, max(spacing, length / 120))
-    for along in posts.tolist():
-        site.moved(along).pole(height, radii, steel)
-    for level in np.linspace(1.0, 0.25, rng.integers(1, 4)):
-        bar = site.origin + level * height * UP
-        site.tube(bar, bar + posts[-1] * site.frame[0] + 1e-3 * site.frame[0], radii, steel)
-
-
-def wire_fence(site: Site, length: float) -> None:
-    """Wooden posts and the wires between them along the place's x axis."""
-    rng = site.rng
-    wood = site.instance("bark", "fence post")
-    wire = site.instance("metal", "wire")
-    height = rng.uniform(0.9, 1.4)
-    posts = np.arange(0.0, length, rng.uniform(2.0, 4.0)).tolist()
-    for along in posts:
-        foot = site.moved(along).origin
-        site.tube(foot - 0.2 * UP, foot + height * UP, (0.05, 0.045), wood)
-    for level in np.linspace(0.95, 0.3, rng.integers(2, 5)):
-        up = site.moved(0.0, up=level * height)
-        for here, there in pairwise(posts):
-            site.tube(up.moved(here).origin, up.moved(there).origin, (0.008, 0.008), wire)
+    steel = site.instance("metal", "fence bars")
+    height, spacing = rng.uniform(0.6, 1.4), rng.choice([0.15, 0.3, 1.5, 2.5])
+    _rails(
+        site,
+        length,
+        max(spacing, length / 120),
+        height,
+        rng.uniform((0.015, 0.008), 0.05).tolist(),
+        np.linspace(1.0, 0.25, rng.integers(1, 5)),
+        steel,
+    )
 
 
 def barrier(site: Site, length: float, concrete: bool) -> None:
-    """A wall of concrete, or a steel rail on posts, along the place's x axis in pieces of 4 m."""
+    """A wall of concrete, or a steel rail on posts, along the place's x axis."""
     look = site.instance("gravel" if concrete else "metal", "barrier", 0.8)
-    for along in np.arange(0.0, length - 3.9, 4.0).tolist():
-        place = site.moved(along)
-        if concrete:
-            place.box((0.0, -0.3, 0.0), (4.0, 0.3, 0.35), look)
-            place.box((0.0, -0.12, 0.35), (4.0, 0.12, 0.9), look)
-        else:
-            place.pole(0.75, (0.06, 0.06), look)
-            place.box((0.0, -0.05, 0.45), (4.0, 0.05, 0.76), look)
+    if concrete:
+        for along in np.arange(0.0, length - 3.9, 4.0).tolist():
+            site.moved(along).box((0, -0.15, 0), (4.0, 0.3, 0.9), look)
+    else:
+        _rails(site, length, 4.0, 0.75, (0.06, 0.15), [0.8], look)
+
+
+def _rails(
+    site: Site,
+    length: float,
+    spacing: float,
+    height: float,
+    radii: Sequence[float],
+    levels: Iterable[float],
+    look: int,
+) -> None:
+    """Posts, and at some shares of their height bars, in pieces of about 4 m as the road bends.
+
+    Args:
+        site: where they begin.
+        length: along its x axis.
+        spacing: of posts.
+        height: of posts.
+        radii: of a post and of a bar.
+        levels: of the bars.
+        look: of all.
+    """
+    post, bar = radii
+    for along in np.arange(0.0, length, spacing).tolist():
+        site.moved(along).pole(height, (post, post), look)
+    joints = np.linspace(0.0, length, int(length / 4.0) + 2).tolist()
+    for level in levels:
+        ends = [site.moved(along, up=level * height).origin for along in joints]
+        for here, there in pairwise(ends):
+            site.tube(here, there, (bar, bar), look)
 
 
 def post(site: Site) -> None:
@@ -177,20 +188,13 @@ def person(site: Site) -> None:
 
 
 def bonnet(site: Site, below: float, height_m: float) -> None:
-    """The bonnet before a camera, in its frame.
+    """The level bonnet before a camera, in its frame.
 
     Its far edge is seen at the slope ``below`` the axis.
     """
     far = min(site.rng.uniform(1.1, 2.0), 0.6 * height_m / max(below, 0.05))
-    x, z = np.meshgrid(np.linspace(-1.1, 1.1, 15), np.linspace(0.25, far, 8))
-    y = (
-        below * far
-        + 0.12 * (far - z) ** 2
-        + 0.10 * x**2
-        + 0.25 * np.clip(np.abs(x) - 0.7, 0.0, None)
-    )
     paint = site.instance("metal", "bonnet")
-    site.patch(np.stack([x, y, z], axis=2), np.stack([x, z], axis=2), paint)
+    site.box((-1.1, below * far, 0.25), (2.2, 1.0, far - 0.25), paint)
 
 
 def car(site: Site) -> None:
@@ -205,7 +209,7 @@ def car(site: Site) -> None:
     van = rng.random() < 0.2
     waist = rng.uniform(0.82, 0.98)
     roof = rng.uniform(1.38, 1.6) + (0.45 if van else 0.0)
-    site.box((-length / 2, -half, 0.25), (length / 2, half, waist), paint)
+    site.box((-length / 2, -half, 0.25), (length, 2 * half, waist - 0.25), paint)
     hood = rng.uniform(0.10, 0.16) if van else rng.uniform(0.2, 0.3)
     low = (-0.48 * length, (0.5 - hood) * length)
     high = (low[0] + (0.1 if van else rng.uniform(0.2, 0.8)), low[1] - rng.uniform(0.5, 0.8))

@@ -6,13 +6,13 @@ from slam.simulation import objects
 from slam.simulation.geometry import FloatArray
 from slam.simulation.options import StreetKind
 from slam.simulation.route import KERB
-from slam.simulation.shapes import Rectangle, Site, corners_of, directed, grid_over
+from slam.simulation.shapes import Rectangle, Site, grid_over
 
 
 def open_land(
     site: Site, kind: StreetKind, grass: int, inner: Rectangle, sides: list[bool]
 ) -> None:
-    """Land that may rise beside the road to a bank, with trees, bushes, hedges, fences or barriers.
+    """Land that may rise beside the road to a bank, with trees, hedges, fences or barriers.
 
     Args:
         site: takes the surfaces.
@@ -36,21 +36,14 @@ def open_land(
     land = grass if rng.random() < 0.4 else site.instance("grass", crop, 0.6)
     site.patch(points, points[..., :2], land)
     wood = rng.choice([0.0, 1.0, 4.0, 10.0])  # trees in 100 square metres near the road
-    corners = corners_of(inner)
-    for side in np.flatnonzero(sides):
-        start = corners[side]
-        length, ahead, inward, angle = directed(start, corners[(side + 1) % 4])
+    for number in np.flatnonzero(sides):
+        edge, length = site.side(inner, number)
         for _ in range(rng.poisson(0.15 * wood * length)):
             far = 15.0 * rng.random() ** 1.5
-            x, y = start + rng.uniform(0.0, length) * ahead + far * inward
-            z = float(ground(x, y))
-            if rng.random() < 0.4:
-                bush = site.instance("leaves", "bush", 0.45)
-                size = rng.uniform(0.5, 1.8)
-                site.ball(np.array([x, y, z + 0.4 * size]), (size, size, 0.8 * size), bush)
-            elif far > 1.5:
-                objects.tree(site.at(x, y, z=z - 0.2), rng.uniform(4.0, 13.0))
-        _edge(site.at(start[0], start[1], angle, KERB), kind, length)
+            spot = edge.moved(rng.uniform(0.0, length), far)
+            sunk = float(ground(*spot.origin[:2])) - 0.2
+            objects.tree(spot.moved(0.0, up=sunk), rng.uniform(1.0, min(13.0, 2.0 + 3.0 * far)))
+        _edge(edge.moved(0.0, up=KERB), kind, length)
 
 
 def _edge(site: Site, kind: StreetKind, length: float) -> None:
@@ -61,14 +54,10 @@ def _edge(site: Site, kind: StreetKind, length: float) -> None:
             objects.barrier(site, length, luck < 0.25)
         elif luck < 0.87:  # against the noise
             wall = site.instance("boards", "noise wall", 0.6, (0.5,))
-            site.box(np.zeros(3), (length, 0.3, site.rng.uniform(2.5, 5.0)), wall)
+            site.box((0, 0, 0), (length, 0.3, site.rng.uniform(2.5, 5.0)), wall)
     elif luck < 0.3:
-        objects.wire_fence(site, length)
-    elif luck < 0.4:
-        objects.hedge(site, length)
+        objects.fence(site, length)
     elif luck < 0.6:
-        for along in np.arange(3.0, length, site.rng.uniform(7.0, 14.0)).tolist():
-            x, y, _ = site.moved(along).moved(0.0, 0.5).origin
-            objects.tree(site.at(x, y), site.rng.uniform(6.0, 12.0))
+        objects.hedge(site, length)
     elif luck < 0.75:
         objects.barrier(site, length, False)

@@ -8,8 +8,8 @@ import numpy as np
 from slam.frames import Intrinsics
 from slam.runtime.errors import SequenceError
 
-VERSION = 2  # of the worlds: the same options give the same bytes within a version
-MOST_FRAMES = 100_000
+VERSION = 3  # of the worlds: the same options give the same bytes within a version
+_MOST_FRAMES = 100_000
 STREET_RATE = 10.0
 _MOST_PIXELS = 2**25
 _READOUT_S = 0.025  # of a rolling shutter, where frames are far enough apart
@@ -30,7 +30,7 @@ class SimulationOptions:
     """The street or the rooms to simulate; ``seed`` determines everything else.
 
     A ``varied`` street is a town's, an avenue, a country road or a motorway (`Variety`) with
-    another camera than KITTI's, hills, hard light, railings and people, and cars that overtake if
+    another camera than KITTI's, hills, hard light, fences and people, and cars that overtake if
     any move; ``varied`` rooms have another focal length. ``rate``, frames a second, and ``motion``
     are of rooms. ``fov_deg`` is the horizontal field of view of square pixels; None is that of the
     world's own camera.
@@ -80,8 +80,8 @@ class SimulationOptions:
             )
         if self.seed < 0:
             raise SequenceError(f"seed must be 0 or more; got {self.seed}")
-        if self.frames > MOST_FRAMES:
-            raise SequenceError(f"a drive has {MOST_FRAMES:,} frames at most; got {self.frames:,}")
+        if not 2 <= self.frames <= _MOST_FRAMES:
+            raise SequenceError(f"a drive has 2 to {_MOST_FRAMES:,} frames; got {self.frames:,}")
         if min(self.width, self.height) < 8 or self.width * self.height > _MOST_PIXELS:
             raise SequenceError(
                 f"images must be 8 x 8 or larger, of {_MOST_PIXELS:,} pixels at most;"
@@ -96,17 +96,17 @@ class SimulationOptions:
 
 @dataclass(frozen=True)
 class Variety:
-    """One varied street and its camera."""
+    """One street and its camera."""
 
     kind: StreetKind  # of street
-    steepness: float  # of hills at most, rise over run
-    wavelength_m: float  # of hills
+    # of hills: steepness at most, rise over run, and wavelength, metres; None: gentle ones
+    hills: tuple[float, float] | None
     fov_deg: float  # of the camera, horizontal
     # of the camera's own image, which is shrunk to the size asked for; None: of that size
     aspect: float | None
     # of the lens beside the middle of the image, shares of its width and height
     centre: tuple[float, float]
-    height_m: float  # of the camera above the road at rest
+    height_m: float | None  # of the camera above the road at rest; None: as KITTI's
     pitch: float  # of the camera, downwards, radians
     roll: float  # of the camera about its axis, clockwise, radians
     bonnet: float  # share of the image's height that shows the car's own bonnet; 0 shows none
@@ -122,24 +122,40 @@ class Variety:
         return Intrinsics(width, height, fx, fy, cx, cy)
 
 
+# a town as KITTI odometry 00-02 see theirs (rectified colour camera, 1241 x 376 pixels)
+USUAL = Variety(
+    kind="town",
+    hills=None,
+    fov_deg=float(2.0 * np.rad2deg(np.arctan(0.5 * 1241 / 718.856))),
+    aspect=1241 / 376,
+    centre=(607.6928 / 1241 - 0.5, 185.7157 / 376 - 0.5),
+    height_m=None,
+    pitch=0.0,
+    roll=0.0,
+    bonnet=0.0,
+    vignette=0.0,
+    noise=0.0,
+    blur_px=0.55,
+)
+
+
 def draw_variety(seed: int, lone_road: bool) -> Variety:
     """The variety of a seed; only a lone road is a motorway."""
     rng = np.random.default_rng([seed, 5])
-    kind = _STREET_KINDS[int(rng.choice(4, p=_STREET_SHARES))]
+    kind = _STREET_KINDS[rng.choice(4, p=_STREET_SHARES)]
     lowest, highest = (0.5, 2.5) if rng.random() < 0.5 else (1.2, 2.0)
     height_m = float(np.exp(rng.uniform(np.log(lowest), np.log(highest))))
     return Variety(
         kind="country" if kind == "motorway" and not lone_road else kind,
-        steepness=float(rng.uniform(0.0, 0.06 if kind == "motorway" else 0.1)),
-        wavelength_m=float(rng.uniform(110.0, 260.0)),
-        fov_deg=float(rng.uniform(50.0, 110.0)),
-        aspect=float(rng.uniform(1.0, 3.4)) if rng.random() < 0.6 else None,
-        centre=(float(rng.uniform(-0.03, 0.03)), float(rng.uniform(-0.05, 0.05))),
+        hills=(rng.uniform(0.0, 0.06 if kind == "motorway" else 0.1), rng.uniform(110.0, 260.0)),
+        fov_deg=rng.uniform(50.0, 110.0),
+        aspect=rng.uniform(1.0, 3.4) if rng.random() < 0.6 else None,
+        centre=(rng.uniform(-0.03, 0.03), rng.uniform(-0.05, 0.05)),
         height_m=height_m,
-        pitch=float(np.deg2rad(rng.uniform(-4.0, 4.0))),
-        roll=float(np.deg2rad(rng.uniform(-2.0, 2.0))),
-        bonnet=float(rng.uniform(0.05, 0.2)) if height_m > 1.1 and rng.random() < 0.3 else 0.0,
-        vignette=float(rng.choice([0.0, rng.uniform(0.0, 0.5)])),
-        noise=float(rng.uniform(0.0, 0.012)),
-        blur_px=float(rng.uniform(0.25, 0.55)),
+        pitch=np.deg2rad(rng.uniform(-4.0, 4.0)),
+        roll=np.deg2rad(rng.uniform(-2.0, 2.0)),
+        bonnet=rng.uniform(0.05, 0.2) if height_m > 1.1 and rng.random() < 0.3 else 0.0,
+        vignette=rng.choice([0.0, rng.uniform(0.0, 0.5)]),
+        noise=rng.uniform(0.0, 0.012),
+        blur_px=rng.uniform(0.25, 0.55),
     )

@@ -3,11 +3,10 @@
 import numpy as np
 
 from slam.simulation.geometry import Material
-from slam.simulation.texture import Lengths, Shader, Texels, cell_hash, grained, mix
+from slam.simulation.texture import Lengths, Shader, Texels, cell_hash, grained, mix, slabs
 
 # light of their own
 GLOWING: dict[Material, float] = {"screen": 1.3, "pane": 2.2, "lamp": 2.5}
-_INK = np.array([[0.12], [0.12], [0.14]], dtype=np.float32)
 
 
 def _plaster(texels: Texels) -> Lengths:
@@ -21,36 +20,20 @@ def _plaster(texels: Texels) -> Lengths:
     return mix(rgb, texels.second * (1.0 + grain), texels.v.band(-1.0, skirting) * (skirting > 0))
 
 
-def _tiles(texels: Texels) -> Lengths:
-    side, joint, checks = texels.parameters[:3]
-    u, v = texels.u.at / side, texels.v.at / side
-    near = np.clip(side / texels.size / 2.0 - 0.5, 0.0, 1.0)
-    tone = 0.07 * near * (cell_hash(u, v, 1) - 0.5)
-    grain = texels.fractal((0.5, 0.4, 0.03), (0.06, 0.05, 0.03))
-    chequered = (np.floor(u) + np.floor(v)) % 2 * checks * near
-    rgb = mix(texels.first * (1.0 + grain + tone), 0.5 * texels.second, chequered)
-    return mix(rgb, texels.second, texels.joints(side, side, joint))
-
-
 def _boards(texels: Texels) -> Lengths:
     width = texels.parameters[0]
     row = np.floor(texels.v.at / width)
-    along = np.asarray(texels.u.at + 0.9 * cell_hash(row, row, 2), dtype=np.float32)
+    along = texels.u.at + 0.9 * cell_hash(row, row, 2)
     near = np.clip(width / texels.v.size - 1.0, 0.0, 1.0)
-    tone = 0.3 * near * (cell_hash(np.divide(along, 0.9, dtype=np.float32), row, 4) - 0.5)
+    tone = 0.3 * near * (cell_hash(along / 0.9, row, 4) - 0.5)
     veins = texels.fractal((0.9, 0.06, 0.1), (0.25, 0.02, 0.12), (0.08, 0.008, 0.1))
     gaps = np.maximum(texels.v.stripes(width, 0.006), texels.u.on(along).stripes(0.9, 0.006))
     return texels.first * (1.0 + tone + veins) * (1.0 - 0.55 * gaps)
 
 
 def _carpet(texels: Texels) -> Lengths:
-    width, height, motif = texels.parameters[:3]
-    u, v = texels.u.at - 0.5 * width, texels.v.at - 0.5 * height
-    lozenge = np.abs((u / motif) % 1.0 - 0.5) + np.abs((v / motif) % 1.0 - 0.5)
-    soft = texels.size / motif
-    figure = np.clip((0.3 - lozenge) / np.maximum(soft, 0.02) + 0.5, 0.0, 1.0) * np.clip(
-        0.7 / soft - 1.0, 0.0, 1.0
-    )
+    motif = texels.parameters[2]
+    figure = texels.u.stripes(motif, 0.5 * motif) * texels.v.stripes(motif, 0.5 * motif)
     border = texels.rim(0.18) - texels.rim(0.08)
     grain = 1.0 + texels.fractal((0.3, 0.3, 0.08), (0.03, 0.03, 0.12), (0.01, 0.01, 0.15))
     return mix(texels.first, texels.second, np.maximum(figure, border)) * grain
@@ -70,43 +53,24 @@ def _books(texels: Texels) -> Lengths:
     row, shift = texels.parameters[2], texels.u.shift
     shelf = np.floor(texels.v.at / row)
     above = texels.v.on(texels.v.at - shelf * row)
-    cell = texels.u.at / 0.045 + 0.3 * cell_hash(shelf, shelf + shift, 3)
-    spine = np.floor(cell + 0.35 * cell_hash(cell, shelf + shift, 5))
-    luck = [cell_hash(spine + shift, shelf + texels.v.shift, salt) for salt in (11, 12, 13)]
-    filled = cell_hash((spine / 7.0 + shift).astype(np.float32), shelf, 14) > 0.15
-    tall = row * (0.55 + 0.33 * luck[0]) * filled
+    cell = texels.u.at / 0.045
+    spine = np.floor(cell + 0.35 * cell_hash(cell, shelf + shift, 5)) + shift
+    spines = np.stack([cell_hash(spine, shelf + texels.v.shift, salt) for salt in (11, 12, 13)])
     near = np.clip(0.045 / texels.u.size - 0.4, 0.0, 1.0)
-    spines = 0.1 + 0.55 * (0.5 * np.stack(luck) + 0.5 * luck[0]).astype(np.float32) * (
-        0.5 + 0.5 * luck[1]
-    )
-    title = above.band(0.6 * tall, 0.75 * tall) * (luck[2] > 0.5)
-    rgb = mix(np.float32(0.42), mix(spines, 1.0 - 0.6 * spines, 0.8 * title), near)
-    rgb = mix(0.25 * texels.first, rgb, above.band(0.0, tall))
+    rgb = mix(np.float32(0.35), 0.1 + 0.5 * spines, near)
+    rgb = mix(0.25 * texels.first, rgb, above.band(0.0, row * (0.55 + 0.33 * spines[0])))
     boards = np.maximum(texels.v.stripes(row, 0.024, 0.012), texels.rim(0.025))
     return mix(rgb, texels.first * (1.0 + texels.fractal((0.4, 0.05, 0.1))), boards)
 
 
 def _picture(texels: Texels) -> Lengths:
-    """A painting of blots, or a poster of a picture and text, in a frame."""
-    _, height, kind = texels.parameters[:3]
-    blot = texels.fractal((0.31, 0.27, 1.0), (0.12, 0.11, 0.7), (0.05, 0.05, 0.4))
+    """Blots of three colours in a frame."""
+    blot = texels.fractal((0.31, 0.27, 1.0), (0.12, 0.11, 0.7), (0.05, 0.05, 0.6))
     first = np.clip(9.0 * blot + 0.5, 0.0, 1.0)
     second = np.clip(9.0 * np.abs(blot - 0.3) - 1.2, 0.0, 1.0)
     third = np.stack([texels.second[2], texels.first[0], texels.second[0]])
     rgb = mix(mix(third, texels.first, second), texels.second, first)
-    paper = mix(np.float32(0.9), _INK, _text(texels, 0.03 + 0.02 * (kind - 1.0), 0.035))
-    rgb = mix(rgb, paper, texels.v.band(0.0, 0.38 * height) * (kind > 0))
-    return mix(rgb, np.where(kind > 0, 0.92, 0.25 * texels.first), texels.rim(0.03))
-
-
-def _screen(texels: Texels) -> Lengths:
-    """Windows of text on a desktop."""
-    width, height = texels.parameters[:2]
-    pane = (texels.u.at % (0.5 * width) > 0.03 * width) & (
-        texels.v.at % (0.7 * height) > 0.06 * height
-    )
-    text = mix(np.float32(0.85), _INK, _text(texels, 0.018, 0.02))
-    return mix(mix(texels.second, text, pane), 0.3 * _INK, texels.rim(0.015))
+    return mix(rgb, 0.25 * texels.first, texels.rim(0.03))
 
 
 def _pane(texels: Texels) -> Lengths:
@@ -120,28 +84,16 @@ def _pane(texels: Texels) -> Lengths:
 
 
 def _carton(texels: Texels) -> Lengths:
-    width, height = texels.parameters[:2]
-    grain = texels.fractal((0.6, 0.5, 0.07), (0.1, 0.1, 0.05), (0.015, 0.2, 0.04))
+    _, height = texels.parameters[:2]
+    grain = texels.fractal((0.6, 0.5, 0.07), (0.1, 0.1, 0.08), (0.02, 0.06, 0.08))
     tape = texels.v.band(0.47 * height, 0.47 * height + 0.05)
-    rgb = mix(texels.first * (1.0 + grain), 1.25 * texels.first, 0.7 * tape)
-    label = texels.u.band(0.1 * width, 0.45 * width)
-    label = label * texels.v.band(0.08 * height, 0.38 * height) * (texels.second[0] > 0.3)
-    text = mix(np.float32(0.88), texels.second * 0.3, _text(texels, 0.035, 0.03))
-    return mix(rgb, text, label) * (1.0 - 0.35 * texels.rim(0.008))
-
-
-def _text(texels: Texels, line: Lengths | float, letter: float) -> Lengths:
-    """Coverage by lines of words."""
-    row = np.floor(texels.v.at / line)
-    word = cell_hash(texels.u.at / letter + texels.u.shift, row + texels.v.shift, 7) > 0.35
-    near = np.clip(letter / texels.size - 0.7, 0.0, 1.0)
-    written = word * near + 0.65 * (1.0 - near)
-    return texels.v.stripes(line, 0.55 * line) * written
+    rgb = mix(texels.first * (1.0 + grain), texels.second, 0.7 * tape)
+    return rgb * (1.0 - 0.35 * texels.rim(0.008))
 
 
 ROOM_SHADERS: dict[Material, Shader] = {
     "plaster": _plaster,
-    "tiles": _tiles,
+    "tiles": slabs(0.07, (0.5, 0.4, 0.03), (0.06, 0.05, 0.03)),
     "boards": _boards,
     "carpet": _carpet,
     "wood": _wood,
@@ -150,7 +102,7 @@ ROOM_SHADERS: dict[Material, Shader] = {
     ),
     "books": _books,
     "picture": _picture,
-    "screen": _screen,
+    "screen": _picture,
     "pane": _pane,
     "carton": _carton,
     "lamp": grained(),

@@ -3,10 +3,8 @@
 import functools
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.geometry import se3
-from slam.runtime.errors import SequenceError
 from slam.simulation.carried import Carried, Floor
 from slam.simulation.geometry import MATERIALS, Float32Array, FloatArray, Mesh, luck
 from slam.simulation.interior import interior_of
@@ -14,12 +12,12 @@ from slam.simulation.irradiance import irradiance_of
 from slam.simulation.objects import person
 from slam.simulation.options import SimulationOptions
 from slam.simulation.room_textures import GLOWING
-from slam.simulation.shapes import Moving
+from slam.simulation.shapes import things
 from slam.simulation.world import (
-    SHUTTER,
     Hits,
     SimulatedWorld,
     Surface,
+    between,
     place_rays,
     square_camera,
     through_lens,
@@ -33,6 +31,7 @@ _AHEAD_S = 3.5  # by this time
 _NEAREST_M = 0.7  # of a person to the camera, below which the person is left out
 _GREY = 0.4  # brightness that exposure aims at
 _LONGEST_S = 0.02  # exposure in the light
+_MOST_OPEN = 0.9  # of the time between frames, of the shutter
 _METER_S = 0.1  # the meter's period
 _METERED = 12  # how often it is read
 _METER_WEIGHTS = np.exp(-_METER_S * np.arange(_METERED) / 0.35)  # the newest reading first
@@ -43,13 +42,7 @@ class SimulatedRooms(SimulatedWorld):
     """A house and a walk through it; the attributes are those of `SimulatedWorld`."""
 
     def __init__(self, options: SimulationOptions) -> None:
-        """Plan the house and the walk.
-
-        Raises:
-            SequenceError: if there are fewer than two frames.
-        """
-        if options.frames < 2:
-            raise SequenceError(f"a walk needs at least 2 frames; got {options.frames}")
+        """Plan the house and the walk."""
         self.options, self._interior = options, interior_of(options.seed)
         floor = Floor(self._interior, options.seed)
         seconds = options.frames / options.rate + _AHEAD_S + 1.0
@@ -63,13 +56,13 @@ class SimulatedRooms(SimulatedWorld):
         ]
         rng = luck(options.seed, 57)
         # around their own origins, looking along x
-        self._people = Moving(rng, [person] * _PEOPLE) if peopled else None
+        self._people = things(rng, [person] * _PEOPLE) if peopled else []
         fov = options.fov_deg or _USUAL_FOV_DEG
         if options.varied and options.fov_deg is None:
             fov = float(np.exp(luck(options.seed, 55).uniform(*np.log(_VARIED_FOV_DEG))))
-        moments = self._moments(np.arange(options.frames) / options.rate)
+        seconds_of_frames = np.arange(options.frames) / options.rate
         camera = square_camera(options.width, options.height, fov)
-        super().__init__(options, camera, self._carried.poses(moments))
+        super().__init__(options, camera, self._poses(seconds_of_frames))
 
     def _build(self) -> Mesh:
         return self._interior.mesh
@@ -78,68 +71,39 @@ class SimulatedRooms(SimulatedWorld):
     def _irradiance(self) -> Float32Array:
         return irradiance_of(self.options.seed, "exposure" in self.options.hazards)
 
-    def _moments(self, seconds: FloatArray) -> FloatArray:
-        """Where in the motion the camera is at times ``(N,)``: it may be put down halfway."""
-        if "stop" not in self.options.hazards:
-            return seconds
-        middle = 0.5 * max(len(self) / self.options.rate - STILL_S, 0.0)
-        return seconds - np.clip(seconds - middle, 0.0, STILL_S)
+    def _poses(self, seconds: FloatArray) -> FloatArray:
+        if "stop" in self.options.hazards:  # the camera is put down halfway
+            middle = 0.5 * max(len(self) / self.options.rate - STILL_S, 0.0)
+            seconds = seconds - np.clip(seconds - middle, 0.0, STILL_S)
+        return self._carried.poses(seconds)
 
-    def _exposures(self, index: int) -> FloatArray:
-        options = self.options
-        offsets = np.zeros((1, 1))
-        if "blur" in options.hazards:
-            forward = self._T_scene_camera[max(index - 1, 0) : index + 2, :3, 2]
-            turned = np.linalg.norm(np.diff(forward, axis=0), axis=1).max()
-            longest_s = 2.0 * SHUTTER * 0.9 / options.rate
-            open_s = min(_LONGEST_S * self._gain(index) / self._usual_gain, longest_s)
-            blurred_px = turned * open_s * options.rate * self.camera.fx
-            samples = int(np.clip(blurred_px / 4.0, 3, 12))
-            offsets = offsets + open_s * ((np.arange(samples)[:, None] + 0.5) / samples - 0.5)
-        if options.readout_s:
-            rows = (np.arange(options.height) + 0.5) / options.height - 0.5
-            offsets = offsets + options.readout_s * rows
-        moments = self._moments(index / options.rate + offsets.ravel())
-        poses = self._carried.poses(np.maximum(moments, 0.0)).reshape(*offsets.shape, 4, 4)
-        return poses[:, 0] if offsets.shape[1] == 1 else poses
+    def _shutter(self, index: int) -> tuple[float, int]:
+        forward = self._T_scene_camera[max(index - 1, 0) : index + 2, :3, 2]
+        turned = np.linalg.norm(np.diff(forward, axis=0), axis=1).max()
+        rate = self.options.rate
+        open_s = min(_LONGEST_S * self._gain(index) / self._usual_gain, _MOST_OPEN / rate)
+        blurred_px = turned * open_s * rate * self.camera.fx
+        return open_s, int(np.clip(blurred_px / 4.0, 3, 12))
 
     def _moving(self, index: int) -> list[Mesh]:
-        if self._people is None:
-            return []
         now = index / self.options.rate
         # the first walks where the camera will be
         walkers = [(self._carried, now + _AHEAD_S), *((walk, now) for walk in self._walks)]
         camera = self._T_scene_camera[index, :2, 3]
-        seen = {}
-        for number, (walk, seconds) in enumerate(walkers):
+        seen = []
+        for mesh, (walk, seconds) in zip(self._people, walkers):
             T_scene_person = _standing(walk, seconds)
             if np.linalg.norm(T_scene_person[:2, 3] - camera) > _NEAREST_M:
-                seen[number] = T_scene_person
-        return self._people.placed(seen)
+                seen.append(mesh.placed(T_scene_person))
+        return seen
 
     def _shade(self, hits: Hits, surfaces: list[Surface]) -> Float32Array:
         rgb = hits.unlit(self.camera.fx)
-        if hits.surface is self._still:
-            return rgb * self._light(hits.triangle, hits.barycentric)
-        # people are as bright as what is below them
-        down = hits.rays.copy()
-        down[:, :3] += down[:, 3:] * hits.depth[:, None]
-        down[:, 3:] = (0.0, 0.0, -1.0)
-        below = self._still.cast(down)["primitive_ids"].astype(np.int64)
-        below = np.minimum(below, self._irradiance.shape[1] - 1)
-        light = self._irradiance[:, below].mean(axis=0)
-        return rgb * light * (0.85 + 0.15 * hits.normals[2])
-
-    def _light(self, triangle: NDArray[np.int64], barycentric: Float32Array) -> Float32Array:
-        """Irradiance at points of triangles ``(N,)``; of what glows, its own light."""
-        corners = np.take(self._irradiance, triangle, axis=1)
-        light = (
-            corners[0]
-            + barycentric[0] * (corners[1] - corners[0])
-            + barycentric[1] * (corners[2] - corners[0])
-        )
-        glow = _GLOW[np.take(self._still.mesh.material, triangle)]
-        return np.where(glow > 0.0, glow, light)
+        if hits.surface is not self._still:  # people are lit as the house is in the mean
+            return rgb * self._irradiance.mean() * (0.85 + 0.15 * hits.normals[2])
+        light = between(np.take(self._irradiance, hits.triangle, axis=1), hits.barycentric)
+        glow = _GLOW[np.take(self._still.mesh.material, hits.triangle)]
+        return rgb * np.where(glow > 0.0, glow, light)
 
     def _develop(self, rgb: Float32Array, index: int) -> Float32Array:
         """Gain, lens blur and noise."""
@@ -168,19 +132,15 @@ class SimulatedRooms(SimulatedWorld):
 
     @functools.lru_cache(maxsize=256)  # noqa: B019 - readings are small, worlds are kept for long
     def _brightness(self, tick: int) -> float:
-        """Mean of a coarse image without textures, as the camera's meter sees it."""
-        moment = self._moments(np.array([tick * _METER_S]))
-        few = self._rays[:: max(len(self._rays) // 400, 1)]
-        answer = self._still.cast(place_rays(self._carried.poses(moment)[0], few))
-        met = np.isfinite(answer["t_hit"])
-        triangle = answer["primitive_ids"][met].astype(np.int64)
-        light = self._light(triangle, answer["primitive_uvs"][met].T)
-        colours = self._still.mesh.colours[0].mean(axis=0)
-        return float(np.minimum(light * colours[self._still.mesh.instance[triangle]], 1.5).mean())
+        """Mean of a coarse image without people, as the camera's meter sees it."""
+        (pose,) = self._poses(np.array([tick * _METER_S]))
+        every = max(len(self._rays) // 400, 1)
+        rays = place_rays(pose, self._rays[::every])
+        rgb = self._colours([self._still], rays, self._stretch[::every])
+        return float(np.minimum(rgb, 1.5).mean())
 
 
 def _standing(walk: Carried, seconds: float) -> FloatArray:
     """``T_scene_person`` of whoever walks so, upright on the floor."""
-    x, y, _, yaw, _, _ = walk.at(np.array([seconds]))[:, 0]
-    c, s = np.cos(yaw), np.sin(yaw)
-    return se3.make(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.array([x, y, -0.1]))
+    ((x, y, _, yaw, _, _),) = walk.at(np.array([seconds]))
+    return se3.from_rotation_vector(np.array([0.0, 0.0, yaw]), np.array([x, y, -0.1]))

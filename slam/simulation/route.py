@@ -44,8 +44,8 @@ class StreetPlan:
 
     xs: FloatArray  # x of the grid lines, the first and last of which are the edge of town, (X,)
     ys: FloatArray  # y of the grid lines, likewise, (Y,)
-    along_x: BoolArray  # whether the edge from node (i, j) to (i + 1, j) is a street, (X - 1, Y)
-    along_y: BoolArray  # whether the edge from node (i, j) to (i, j + 1) is a street, (X, Y - 1)
+    # whether the edges from node (i, j) to (i + 1, j), and to (i, j + 1), are streets, (2, X, Y)
+    streets: BoolArray
     half_width: float  # of every street, metres
     drive: tuple[Node, ...]  # nodes in the order in which the camera passes them
     kind: StreetKind = "town"  # of streets and what stands beside them
@@ -56,10 +56,8 @@ class StreetPlan:
 
     def is_street(self, a: Node, b: Node) -> bool:
         """Whether two neighbouring nodes are joined by a street."""
-        i, j = min(a, b)
-        if i < 0 or j < 0 or max(a[0], b[0]) >= len(self.xs) or max(a[1], b[1]) >= len(self.ys):
-            return False
-        return bool(self.along_x[i, j] if a[1] == b[1] else self.along_y[i, j])
+        i, j = min(a, b)  # -1 is the last one, from which no edge leads on
+        return bool(self.streets[int(a[0] == b[0]), i, j])
 
 
 def loop_cycle(rng: np.random.Generator, edges: int) -> list[Node]:
@@ -145,14 +143,13 @@ def town_plan(
     lines = [_lines(rng, int(count), spacing) for count in span]
     half_width = rng.uniform(4.6, 5.2)
     shifted = [(i + 1, j + 1) for i, j in drive]
-    along_x = rng.random((len(lines[0]) - 1, len(lines[1]))) < side_streets
-    along_y = rng.random((len(lines[0]), len(lines[1]) - 1)) < side_streets
-    along_x[:, [0, -1]] = False
-    along_y[[0, -1], :] = False
+    streets = np.zeros((2, len(lines[0]), len(lines[1])), dtype=bool)
+    streets[0, :-1] = rng.random(streets[0, :-1].shape) < side_streets
+    streets[1, :, :-1] = rng.random(streets[1, :, :-1].shape) < side_streets
+    streets[0, :, [0, -1]] = streets[1, [0, -1]] = False
     for a, b in pairwise(shifted):
-        low = min(a, b)
-        (along_x if a[1] == b[1] else along_y)[low] = True
-    return StreetPlan(lines[0], lines[1], along_x, along_y, half_width, tuple(shifted), kind)
+        streets[(int(a[0] == b[0]), *min(a, b))] = True
+    return StreetPlan(lines[0], lines[1], streets, half_width, tuple(shifted), kind)
 
 
 def road_plan(rng: np.random.Generator, length: float, kind: StreetKind = "town") -> StreetPlan:
@@ -162,12 +159,12 @@ def road_plan(rng: np.random.Generator, length: float, kind: StreetKind = "town"
     ends = np.cumsum(gaps)
     xs = np.concatenate([[0.0], ends[: int(np.searchsorted(ends, length + 160.0)) + 1]])
     ys = np.array([-MARGIN, 0.0, MARGIN])
-    along_x = np.zeros((len(xs) - 1, 3), dtype=bool)
-    along_x[:, 1] = True
-    along_y = rng.random((len(xs), 2)) < side_streets
-    along_y[[0, -1], :] = False
+    streets = np.zeros((2, len(xs), 3), dtype=bool)
+    streets[0, :-1, 1] = True
+    streets[1, :, :-1] = rng.random((len(xs), 2)) < side_streets
+    streets[1, [0, -1]] = False
     drive = tuple((i, 1) for i in range(len(xs)))
-    return StreetPlan(xs, ys, along_x, along_y, rng.uniform(*widths), drive, kind)
+    return StreetPlan(xs, ys, streets, rng.uniform(*widths), drive, kind)
 
 
 def _lines(rng: np.random.Generator, count: int, spacing: float) -> FloatArray:
@@ -178,22 +175,18 @@ def _lines(rng: np.random.Generator, count: int, spacing: float) -> FloatArray:
     return np.concatenate([[-MARGIN], [0.0], np.cumsum(gaps), [gaps.sum() + MARGIN]])
 
 
-def _outline(cells: set[Node]) -> dict[tuple[Node, Node], None]:
+def _outline(cells: set[Node]) -> list[tuple[Node, Node]]:
     """Directed edges around a set of cells, cells on the left."""
     edges: dict[tuple[Node, Node], None] = {}
     for x, y in sorted(cells):
         ring = [(x, y), (x + 1, y), (x + 1, y + 1), (x, y + 1)]
-        for edge in zip(ring, ring[1:] + ring[:1]):
-            if edge[::-1] in edges:
-                del edges[edge[::-1]]
-            else:
-                edges[edge] = None
-    return edges
+        edges |= dict.fromkeys(zip(ring, ring[1:] + ring[:1]))
+    return [edge for edge in edges if edge[::-1] not in edges]
 
 
-def _trace(outline: dict[tuple[Node, Node], None]) -> list[Node] | None:
+def _trace(outline: list[tuple[Node, Node]]) -> list[Node] | None:
     """Chain an outline into one cycle; None if it touches itself or has a hole."""
-    following = dict(outline.keys())
+    following = dict(outline)
     if len(following) < len(outline):
         return None
     first = next(iter(following))
@@ -217,9 +210,7 @@ class Route:
     sample: FloatArray  # where in lane_street each frame is, (N,)
 
 
-def plan_route(
-    route: str, frames: int, seed: int, still_frames: int = 0, variety: Variety | None = None
-) -> Route:
+def plan_route(route: str, frames: int, seed: int, still_frames: int, variety: Variety) -> Route:
     """Lay out streets and a drive over them.
 
     Args:
@@ -228,7 +219,7 @@ def plan_route(
         frames: of the drive.
         seed: of every draw.
         still_frames: how many of the frames stand in the middle.
-        variety: of the streets and the camera; without one it is a town, and a camera like KITTI's.
+        variety: of the streets and the camera.
 
     Raises:
         SequenceError: if there are too few frames for the route.
@@ -246,7 +237,8 @@ def plan_route(
     if route == "loop":
         arrival *= (moving - 1.0) / arrival[-1]
     rng = luck(seed, 2)
-    camera_height_m = rng.uniform(1.5, 1.8) if variety is None else variety.height_m
+    usual_m = rng.uniform(1.5, 1.8)
+    camera_height_m = variety.height_m or usual_m
     sample = np.interp(np.arange(moving), arrival, np.arange(len(arrival)))
     T_street_camera = _poses(rng, bend, lane_plan, sample, camera_height_m, variety)
     if stops:
@@ -263,12 +255,11 @@ def _level(points_plan: FloatArray) -> FloatArray:
 
 
 def _layout(
-    route: str, moving: int, seed: int, stops: bool, variety: Variety | None
+    route: str, moving: int, seed: int, stops: bool, variety: Variety
 ) -> tuple[StreetPlan, Bend, FloatArray]:
     """Streets, their bend, and the lane to drive ``(M, 2)``, long enough for ``moving`` frames."""
     rng = luck(seed, 0)
-    kind: StreetKind = "town" if variety is None else variety.kind
-    hills = None if variety is None else (variety.steepness, variety.wavelength_m)
+    kind, hills = variety.kind, variety.hills
     if route == "straight":
         end = START + 1.25 * moving + 5.0
         plan = road_plan(rng, end, kind)
@@ -316,8 +307,7 @@ def _lane(plan: StreetPlan, seed: int) -> FloatArray:
     rng = luck(seed, 3)
     nodes = np.stack([plan.node(node) for node in plan.drive])  # (n, 2)
     offset = _lane_offset(plan, seed)
-    ahead = np.diff(nodes, axis=0)
-    ahead = unit(ahead)
+    ahead = unit(np.diff(nodes, axis=0))
     right = np.stack([ahead[:, 1], -ahead[:, 0]], axis=1)
     turns = ahead[:-1, 0] * ahead[1:, 1] - ahead[:-1, 1] * ahead[1:, 0]
     sideways = np.concatenate([right, right[-1:]])
@@ -328,8 +318,7 @@ def _lane(plan: StreetPlan, seed: int) -> FloatArray:
         rounded += _corner(rng, before, corner, after)
     path = _resample(np.stack([corners[0], *rounded, corners[-1]]))
     path = gaussian_filter1d(path, 1.6 / STEP, axis=0, mode="nearest")
-    tangent = np.gradient(path, axis=0)
-    tangent = unit(tangent)
+    tangent = unit(np.gradient(path, axis=0))
     drift = gaussian_filter1d(rng.standard_normal(len(path)), 14.0 / STEP)
     drift *= 0.13 / max(drift.std(), 1e-9)
     path += np.clip(drift, -0.28, 0.28)[:, None] * np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
@@ -388,21 +377,16 @@ def _poses(
     lane_plan: FloatArray,
     sample: FloatArray,
     height_m: float,
-    variety: Variety | None,
+    variety: Variety,
 ) -> FloatArray:
-    """``T_street_camera`` ``(N, 4, 4)`` at fractional lane points ``sample`` ``(N,)``, suspended.
-
-    Without a ``variety`` the camera was mounted level but for a little pitch.
-    """
+    """``T_street_camera`` ``(N, 4, 4)`` at fractional lane points ``sample`` ``(N,)``, suspended."""
     rows = np.arange(len(lane_plan))
     direction = gaussian_filter1d(np.gradient(lane_plan, axis=0), 4.0, axis=0)
-    tangent = se3.interpolated(sample, rows, direction)
-    tangent = unit(tangent)
+    tangent = unit(se3.interpolated(sample, rows, direction))
     at, ahead = _level(se3.interpolated(sample, rows, lane_plan)), _level(tangent)
     across = np.stack([tangent[:, 1], -tangent[:, 0], np.zeros(len(at))], axis=1)
-    forward = bend(at + ahead) - bend(at - ahead)
+    forward = unit(bend(at + ahead) - bend(at - ahead))
     right = bend(at + across) - bend(at - across)
-    forward = unit(forward)
     right -= (right * forward).sum(axis=1, keepdims=True) * forward
     right = unit(right)
     down = np.cross(forward, right)
@@ -414,10 +398,9 @@ def _poses(
     mixed = (0.8 * slow + 0.6 * fast)[30:-30]
     sizes = np.array([np.deg2rad(0.3), np.deg2rad(0.2), np.deg2rad(0.3), 0.012])
     suspension = np.clip(mixed, -2.2, 2.2) * sizes
-    if variety is None:
-        suspension[:, 0] += np.deg2rad(rng.uniform(-0.8, 0.8))
-    else:
-        suspension[:, [0, 2]] += -variety.pitch, variety.roll
+    # nobody mounts a camera level
+    suspension[:, 0] += np.deg2rad(rng.uniform(-0.8, 0.8)) - variety.pitch
+    suspension[:, 2] += variety.roll
     position = bend(at) - (height_m + suspension[:, 3:]) * down
     T_street_level = se3.make(np.stack([right, down, forward], axis=2), position)
     return T_street_level @ se3.from_rotation_vector(suspension[:, :3], np.zeros((len(at), 3)))

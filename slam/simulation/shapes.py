@@ -1,7 +1,6 @@
 """Where surfaces are built: simple bodies and their looks, and level rectangles of a plan."""
 
 import copy
-import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from operator import itemgetter
@@ -29,8 +28,6 @@ from slam.simulation.geometry import (
 Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1
 
 UP = np.array([0.0, 0.0, 1.0])
-# fields of a mesh whose last axis is that of its triangles
-_OF_TRIANGLES = ("uv", "normals", "tangents", "instance", "material")
 
 
 @functools.cache
@@ -70,19 +67,25 @@ class Site:
         """Where it is, ``(3,)``."""
         return self.frame[3]
 
-    def at(self, x: float, y: float, angle: float = 0.0, z: float = 0.0) -> "Site":
-        """Another place in the plan, its x axis turned by ``angle`` radians from east."""
-        c, s = np.cos(angle), np.sin(angle)
-        site = copy.copy(self)
-        site.frame = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0], [x, y, z]])
+    def moved(
+        self, along: float, across: float = 0.0, up: float = 0.0, turn: float = 0.0
+    ) -> "Site":
+        """The place so far along its own axes, metres, turned by radians to the left."""
+        c, s = np.cos(turn), np.sin(turn)
+        axes, site = self.frame[:3], copy.copy(self)
+        turned = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) @ axes
+        site.frame = np.vstack([turned, self.origin + (along, across, up) @ axes])
         return site
 
-    def moved(self, along: float, across: float = 0.0, up: float = 0.0) -> "Site":
-        """The place so far along its own axes, metres."""
-        site = copy.copy(self)
-        site.frame = self.frame.copy()
-        site.frame[3] += along * self.frame[0] + across * self.frame[1] + up * self.frame[2]
-        return site
+    def side(self, rectangle: Rectangle, number: int) -> tuple["Site", float]:
+        """Where a side of a rectangle begins, x along it and y inwards, and the side's length.
+
+        Sides are numbered counterclockwise: 0 south, 1 east, 2 north, 3 west.
+        """
+        x0, y0, x1, y1 = rectangle
+        x, y = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))[number % 4]
+        length = y1 - y0 if number % 2 else x1 - x0
+        return self.moved(x, y, turn=number * np.pi / 2.0), length
 
     def drawn_by(self, rng: np.random.Generator) -> "Site":
         """The place with other luck."""
@@ -144,32 +147,31 @@ class Site:
             points, np.array([[[0, 0], [width, 0]], [[0, height], [width, height]]]), instance
         )
 
-    def box(self, low: ArrayLike, high: ArrayLike, instance: int, top: int = -1) -> None:
-        """Four walls and a lid between two corners at the place; ``top`` may look different."""
-        axis_x, axis_y, axis_z, origin = self.frame
-        low, high = np.array(low), np.array(high)
-        wx, wy, wz = high - low
-        corner = origin + low @ self.frame[:3]
-        self.quad(corner, wx * axis_x, wz * axis_z, instance)
-        self.quad(corner + wx * axis_x, wy * axis_y, wz * axis_z, instance)
-        self.quad(corner + wx * axis_x + wy * axis_y, -wx * axis_x, wz * axis_z, instance)
-        self.quad(corner + wy * axis_y, -wy * axis_y, wz * axis_z, instance)
-        self.quad(corner + wz * axis_z, wx * axis_x, wy * axis_y, instance if top < 0 else top)
-
-    def solid(
+    def box(
         self, low: tuple[float, ...], size: tuple[float, ...], look: int, top: int = -1
     ) -> None:
-        """A box by its lowest corner and its size, closed below."""
-        self.box(low, np.add(low, size), look, top)
+        """Walls and a lid from the lowest corner at the place, and a floor where that is above it.
+
+        Args:
+            low: the lowest corner ``(3,)``.
+            size: along the place's axes ``(3,)``.
+            look: an instance.
+            top: that of the lid, if another.
+        """
+        x, y, z = np.array(size)[:, None] * self.frame[:3]
+        corner = self.moved(*low).origin
+        self.quad(corner, x, z, look)
+        self.quad(corner + x, y, z, look)
+        self.quad(corner + x + y, -x, z, look)
+        self.quad(corner + y, -y, z, look)
+        self.quad(corner + z, x, y, look if top < 0 else top)
         if low[2] > 0.0:
-            foot = self.origin + low @ self.frame[:3] + size[1] * self.frame[1]
-            self.quad(foot, size[0] * self.frame[0], -size[1] * self.frame[1], look)
+            self.quad(corner + y, x, -y, look)
 
     def plate(self, low: tuple[float, ...], size: tuple[float, ...], front: int, rest: int) -> None:
         """A box that shows ``front`` on the side that leaves the wall, a hair before the box."""
-        self.solid(low, size, rest)
-        right = low[0] + size[0], low[1] + size[1] + 0.002, low[2]
-        corner = self.origin + right @ self.frame[:3]
+        self.box(low, size, rest)
+        corner = self.moved(low[0] + size[0], low[1] + size[1] + 0.002, low[2]).origin
         self.quad(corner, -size[0] * self.frame[0], size[2] * self.frame[2], front)
 
     def tube(
@@ -242,40 +244,15 @@ def _last(table: FloatArray) -> Float32Array:
     return np.ascontiguousarray(np.moveaxis(table, 0, -1), dtype=np.float32)
 
 
-class Moving:
-    """Meshes around their own origins, to be placed anew at every frame."""
-
-    def __init__(self, rng: np.random.Generator, makers: Sequence[Callable[[Site], None]]) -> None:
-        """Things that are made one after another at one site."""
-        site, after = Site(rng), []
-        for make in makers:
-            make(site)
-            after.append(len(site.looks))
-        self._mesh = site.finish(FLAT)
-        self._thing_of_triangle = np.searchsorted(after, self._mesh.instance, side="right")
-
-    def placed(self, T_scene_things: dict[int, FloatArray]) -> list[Mesh]:
-        """One mesh of the things of these numbers at their poses ``(4, 4)``; none of no things."""
-        if not T_scene_things:
-            return []
-        parts = [
-            self._part(number, T_scene_thing) for number, T_scene_thing in T_scene_things.items()
-        ]
-        corners = np.concatenate([part.vertices for part in parts])
-        corners_of = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
-        tables = {}
-        for name in _OF_TRIANGLES:
-            tables[name] = np.concatenate([getattr(part, name) for part in parts], axis=-1)
-        return [dataclasses.replace(self._mesh, vertices=corners, triangles=corners_of, **tables)]
-
-    def _part(self, number: int, T_scene_thing: FloatArray) -> Mesh:
-        """The triangles of one thing, three vertices each, moved into the scene."""
-        mine = self._thing_of_triangle == number
-        R, t = T_scene_thing[:3, :3].astype(np.float32), T_scene_thing[:3, 3].astype(np.float32)
-        tables = {name: getattr(self._mesh, name)[..., mine] for name in _OF_TRIANGLES}
-        tables |= {name: R @ tables[name] for name in ("normals", "tangents")}
-        vertices = self._mesh.vertices[self._mesh.triangles[mine].ravel()] @ R.T + t
-        return dataclasses.replace(self._mesh, vertices=vertices, **tables)
+def things(rng: np.random.Generator, makers: Sequence[Callable[[Site], None]]) -> list[Mesh]:
+    """What each maker makes around its own origin, one after another at one site."""
+    site, after = Site(rng), []
+    for make in makers:
+        make(site)
+        after.append(len(site.looks))
+    mesh = site.finish(FLAT)
+    thing_of_triangle = np.searchsorted(after, mesh.instance, side="right")
+    return [mesh.part(thing_of_triangle == number) for number in range(len(makers))]
 
 
 def lattice(u: ArrayLike, v: ArrayLike) -> FloatArray:
@@ -289,20 +266,3 @@ def grid_over(rectangle: Rectangle, z: float, step: float) -> FloatArray:
     x = np.linspace(x0, x1, max(1, int((x1 - x0) / step)) + 1)
     y = np.linspace(y0, y1, max(1, int((y1 - y0) / step)) + 1)
     return np.pad(lattice(x, y), ((0, 0), (0, 0), (0, 1)), constant_values=z)
-
-
-def corners_of(rectangle: Rectangle) -> FloatArray:
-    """South west, south east, north east and north west, ``(4, 2)``."""
-    x0, y0, x1, y1 = rectangle
-    return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
-
-
-def directed(start: FloatArray, end: FloatArray) -> tuple[float, FloatArray, FloatArray, float]:
-    """How an edge in the plan runs.
-
-    Returns:
-        Its length, its direction ``(2,)``, the one to its left and its angle from east.
-    """
-    length = float(np.linalg.norm(end - start))
-    ahead = (end - start) / max(length, 1e-9)
-    return length, ahead, np.array([-ahead[1], ahead[0]]), float(np.arctan2(ahead[1], ahead[0]))

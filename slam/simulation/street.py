@@ -4,36 +4,25 @@ Surfaces are ray-cast with Open3D; everything else is NumPy (``slam/simulation``
 """
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.runtime.imports import import_open3d
 from slam.simulation.geometry import Float32Array, FloatArray, Mesh, luck
 from slam.simulation.objects import bonnet, car
-from slam.simulation.options import SimulationOptions, draw_variety
+from slam.simulation.options import USUAL, SimulationOptions, draw_variety
 from slam.simulation.route import STEP, Route, plan_route
-from slam.simulation.shapes import Moving
+from slam.simulation.shapes import things
 from slam.simulation.texture import Axis, Texels
 from slam.simulation.town import build_town
-from slam.simulation.world import (
-    SHUTTER,
-    Hits,
-    SimulatedWorld,
-    Surface,
-    place_rays,
-    square_camera,
-    through_lens,
-)
+from slam.simulation.world import Hits, SimulatedWorld, Surface, place_rays, through_lens
 
-# KITTI odometry 00-02 (rectified colour camera), at the size it was recorded at
-KITTI_CAMERA = Intrinsics(1241, 376, 718.856, 718.856, 607.1928, 185.2157)
 STILL_FRAMES = 30  # of a stop: 3 s at 10 frames a second
 BLUR_SAMPLES = 6
+SHUTTER = 0.5  # exposure time of a blurred image over the frame interval
 WIDEST_LANE_M = 2.0  # from its middle to its edge
 _DARKEST_MEAN = 0.33  # of an image, to which a camera exposes at least
 
@@ -62,15 +51,14 @@ class SimulatedStreet(SimulatedWorld):
         """
         size = options.width, options.height
         still = STILL_FRAMES if "stop" in options.hazards else 0
-        camera, variety = KITTI_CAMERA.resized(*size), None
-        weather = draw_weather
+        variety, weather = USUAL, draw_weather
         if options.varied:
             variety = draw_variety(options.seed, options.route == "straight")
-            camera, weather = variety.camera(*size), draw_varied_weather
+            weather = draw_varied_weather
         if options.fov_deg is not None:
-            camera = square_camera(*size, options.fov_deg)
+            variety = replace(variety, fov_deg=options.fov_deg, aspect=None, centre=(0.0, 0.0))
         self._route = plan_route(options.route, options.frames, options.seed, still, variety)
-        super().__init__(options, camera, self._route.T_street_camera)
+        super().__init__(options, variety.camera(*size), self._route.T_street_camera)
         self.camera_height_m = self._route.camera_height_m
         self._variety = variety
         self._weather = weather(options.seed)
@@ -89,7 +77,6 @@ class SimulatedStreet(SimulatedWorld):
 
     def scan(self, index: int) -> Float32Array:
         """LiDAR points of a frame ``(M, 4)``: x, y, z in the LiDAR, metres, and reflectance."""
-        self._require(index)
         rng = luck(self.options.seed, 40, index)
         # each spin starts at a random angle: with the same rays in every scan the rings on the
         # ground would repeat exactly, and scan matching would estimate zero motion
@@ -120,19 +107,18 @@ class SimulatedStreet(SimulatedWorld):
 
     def _moving(self, index: int) -> list[Mesh]:
         cars = self._traffic.placed(index) if self._traffic else []
-        bonnet = self._bonnet.placed({0: self._T_scene_camera[index]}) if self._bonnet else []
-        return cars + bonnet
+        return cars + [each.placed(self._T_scene_camera[index]) for each in self._bonnet]
 
     @functools.cached_property
-    def _bonnet(self) -> Moving | None:
+    def _bonnet(self) -> list[Mesh]:
         """The bonnet of the own car; none under motion blur, which would smear it."""
-        if self._variety is None or self._variety.bonnet == 0.0 or "blur" in self.options.hazards:
-            return None
+        if self._variety.bonnet == 0.0 or "blur" in self.options.hazards:
+            return []
         rng = luck(self.options.seed, 12)
         below = (
             self.options.height * (1.0 - self._variety.bonnet) - self.camera.cy
         ) / self.camera.fy
-        return Moving(rng, [lambda site: bonnet(site, below, self.camera_height_m)])
+        return things(rng, [lambda site: bonnet(site, below, self.camera_height_m)])
 
     @functools.cached_property
     def _gain(self) -> float:
@@ -144,21 +130,12 @@ class SimulatedStreet(SimulatedWorld):
         brightest = float(np.quantile(np.max(views, axis=-1), 1.0 - self._weather.saturated))
         return max(1.0 / brightest, _DARKEST_MEAN / float(np.mean(np.minimum(views, brightest))))
 
-    def _exposures(self, index: int) -> FloatArray:
-        T_street_camera = self._T_scene_camera
-        here = T_street_camera[index]
-        # poses while the shutter is open around a frame; all one pose at a stop
-        low, high = max(index - 1, 0), min(index + 1, len(self) - 1)
-        if "blur" not in self.options.hazards:
-            return here[None]
-        T_low_high = se3.invert(T_street_camera[low]) @ T_street_camera[high]
-        turn = Rotation.from_matrix(T_low_high[:3, :3]).as_rotvec()
-        fraction = ((np.arange(BLUR_SAMPLES) + 0.5) / BLUR_SAMPLES - 0.5)[:, None]
-        if np.array_equal(here, T_street_camera[high]):
-            fraction *= 0.0
-        fraction *= SHUTTER / (high - low)
-        motion = fraction * turn, fraction * T_low_high[:3, 3]
-        return np.asarray(here @ se3.from_rotation_vector(*motion))
+    def _poses(self, seconds: FloatArray) -> FloatArray:
+        frames = np.arange(len(self), dtype=np.float64)
+        return se3.interpolate(self._T_scene_camera, frames, seconds * self.options.rate)
+
+    def _shutter(self, index: int) -> tuple[float, int]:
+        return SHUTTER / self.options.rate, BLUR_SAMPLES
 
     def _background(self, directions: Float32Array) -> Float32Array:
         weather, up = self._weather, np.clip(directions[2], 0.0, 1.0)
@@ -213,11 +190,11 @@ class SimulatedStreet(SimulatedWorld):
         rgb = rgb * np.float32(self._gain)
         if "rain" in self.options.hazards:
             rgb = rained_on(rgb, self.options.seed, index)
-        rgb = through_lens(rgb, *([] if self._variety is None else [self._variety.blur_px]))
+        rgb = through_lens(rgb, self._variety.blur_px)
         if "exposure" in self.options.hazards:
             gain, gamma = self._exposure[index]
             rgb = np.asarray(gain * np.power(np.clip(rgb, 0.0, 1.0), gamma), dtype=np.float32)
-        if self._variety is not None:
+        if self.options.varied:
             y, x = (np.linspace(-1.0, 1.0, side, dtype=np.float32) for side in rgb.shape[:2])
             falloff = 1.0 - np.float32(0.5 * self._variety.vignette) * (x * x + (y * y)[:, None])
             grain = luck(self.options.seed, 35, index).standard_normal(rgb.shape, dtype=np.float32)
@@ -233,8 +210,8 @@ def rained_on(rgb: Float32Array, seed: int, index: int) -> Float32Array:
     length = max(3, height // 11)
     kernel = np.zeros((length, length), dtype=np.float32)
     slant = rng.uniform(-0.3, 0.3)
-    for row in range(length):
-        kernel[row, int(length / 2 + slant * (row - length / 2))] = 1.0
+    rows = np.arange(length)
+    kernel[rows, (length / 2 + slant * (rows - length / 2)).astype(int)] = 1.0
     streaks = np.clip(cv2.filter2D(drops, -1, kernel), 0.0, 1.0)[..., None] * 0.4
     veiled = rgb * 0.85 + 0.07
     return veiled + streaks * (0.85 - veiled)
@@ -257,31 +234,21 @@ class Weather:
     contrast: float = 1.0  # of textures, an exponent; 1 as they are painted
 
 
-def _draw_sun(rng: np.random.Generator, lowest: float, highest: float) -> FloatArray:
-    """Its direction at an elevation in radians, ``(3,)``."""
-    azimuth, elevation = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(lowest, highest)
-    level = np.cos(elevation)
-    sun = [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
-    return np.array(sun)
-
-
-def _draw_tint(
-    rng: np.random.Generator, tint: tuple[float, ...], spread: float, bright: float = 1.0
-) -> Float32Array:
-    """A colour of the sky near another, ``(3,)``."""
-    return np.asarray(bright * (tint + rng.uniform(-spread, spread, 3)), dtype=np.float32)
-
-
 def draw_weather(seed: int) -> Weather:
     """Weather of a world."""
     rng = luck(seed, 20)
-    sun, sunshine = _draw_sun(rng, 0.5, 1.1), rng.uniform(0.25, 0.75)
+    azimuth, elevation = rng.uniform((0.0, 0.5), (2.0 * np.pi, 1.1))
+    level = np.cos(elevation)
+    sun = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+    sunshine = rng.uniform(0.25, 0.75)
+    sky = np.array([(0.38, 0.56, 0.85), (0.80, 0.84, 0.88)]) + rng.uniform(-0.06, 0.06, (2, 3))
+    zenith, horizon = sky.astype(np.float32)
     return Weather(
         sun=sun.astype(np.float32),
         sunshine=sunshine,
         ambient=0.95 - 0.6 * sunshine,
-        zenith=_draw_tint(rng, (0.38, 0.56, 0.85), 0.06),
-        horizon=_draw_tint(rng, (0.80, 0.84, 0.88), 0.06),
+        zenith=zenith,
+        horizon=horizon,
         clouds=rng.uniform(0.0, 1.0),
         visibility_m=rng.uniform(220.0, 600.0),
         exposure=rng.uniform(0.95, 1.2),
@@ -289,29 +256,27 @@ def draw_weather(seed: int) -> Weather:
 
 
 def draw_varied_weather(seed: int) -> Weather:
-    """Weather of a varied world.
+    """Weather of a varied world: under the same sun another light, and another camera's gain.
 
     Three in four have a sun beside which shadows are 3 to 10 times as dark.
     """
-    rng = luck(seed, 21)
-    sun = _draw_sun(rng, 0.3, 1.15)
-    sunny = rng.random() < 0.75
-    ambient = (
-        1.0 / float(np.exp(rng.uniform(np.log(3.0), np.log(10.0))))
-        if sunny
-        else rng.uniform(0.6, 0.95)
-    )
-    bright = rng.uniform(0.6, 1.3) if sunny else rng.uniform(0.9, 1.4)
-    return Weather(
-        sun=sun.astype(np.float32),
-        sunshine=(1.0 - ambient) / sun[2],  # a level road has 1 in the sun
+    rng, usual = luck(seed, 21), draw_weather(seed)
+    if rng.random() < 0.75:
+        ambient = np.exp(-rng.uniform(np.log(3.0), np.log(10.0)))
+        bright, clouds, saturated = rng.uniform((0.6, 0.0, 0.04), (1.3, 0.8, 0.11))
+    else:
+        ambient = rng.uniform(0.6, 0.95)
+        bright, clouds, saturated = rng.uniform((0.9, 0.6, 0.0), (1.4, 1.0, 0.04))
+    return replace(
+        usual,
+        sunshine=(1.0 - ambient) / usual.sun[2],  # a level road has 1 in the sun
         ambient=ambient,
-        zenith=_draw_tint(rng, (0.30, 0.52, 0.85), 0.08, bright),
-        horizon=_draw_tint(rng, (0.80, 0.86, 0.92), 0.08, bright),
-        clouds=rng.uniform(0.0, 0.8) if sunny else rng.uniform(0.6, 1.0),
+        zenith=np.float32(bright) * usual.zenith,
+        horizon=np.float32(bright) * usual.horizon,
+        clouds=clouds,
         visibility_m=rng.uniform(300.0, 1500.0),
         exposure=None,
-        saturated=rng.uniform(0.04, 0.11) if sunny else rng.uniform(0.0, 0.04),
+        saturated=saturated,
         contrast=rng.uniform(1.2, 3.0),
     )
 
@@ -322,49 +287,50 @@ class Traffic:
     def __init__(self, drive: Route, seed: int, overtaking: bool = False) -> None:
         rng = luck(seed, 33)
         self._route = drive
-        # offset in lane samples, per frame, to the left in metres, along the lane or against it
-        self._courses: list[tuple[float, float, float, float]] = []
+        # lane samples at each frame, to the left in metres, along the lane or against it
+        self._courses: list[tuple[FloatArray, float, float]] = []
         meets = rng.uniform(4.0, 15.0)
         while meets < len(drive.sample):
             speed = -rng.uniform(0.7, 1.2) / STEP
-            start = drive.sample[int(meets)] - speed * meets
             left_m = 2.0 * drive.lane_offset_m + rng.uniform(0.0, 0.3)
-            self._courses.append((start, speed, left_m, -1.0))
+            self._courses.append((self._beside_at(meets, speed), left_m, -1.0))
             meets += rng.uniform(12.0, 40.0)
         if overtaking:
             self._plan_passing(luck(seed, 34))
-        self._gap = rng.uniform(9.0, 14.0) / STEP
-        self._leader_leaves = rng.uniform(0.4, 0.8) * len(drive.sample)
-        self._cars = Moving(rng, [car] * (1 + len(self._courses)))
+        # the one in the camera's lane keeps its distance, until it drives away
+        gap, leaves = rng.uniform(9.0, 14.0), rng.uniform(0.4, 0.8) * len(drive.sample)
+        away = np.maximum(np.arange(len(drive.sample)) - leaves, 0.0)
+        self._courses.insert(0, (drive.sample + (gap + 0.5 * away) / STEP, 0.0, 1.0))
+        self._cars = things(rng, [car] * len(self._courses))
+
+    def _beside_at(self, frame: float, speed: float) -> FloatArray:
+        """Lane samples of a steady car that is beside the camera at a frame."""
+        sample = self._route.sample
+        return sample[int(frame)] + speed * (np.arange(len(sample)) - frame)
 
     def _plan_passing(self, rng: np.random.Generator) -> None:
         """Courses of cars on the camera's left, and of slower ones on its right."""
-        sample = self._route.sample
-        for _ in range(max(1, len(sample) // 12)):
-            beside = int(rng.integers(len(sample)))
+        frames = len(self._route.sample)
+        for _ in range(max(1, frames // 12)):
+            beside = int(rng.integers(frames))
             left = rng.random() < 0.75
             speed = (rng.uniform(1.15, 1.9) if left else rng.uniform(0.2, 0.8)) / STEP
             lanes = rng.uniform(1.5, 2.1) if left else rng.uniform(-1.1, -0.9)
             left_m = min(self._route.lane_offset_m, WIDEST_LANE_M) * lanes
-            self._courses.append((sample[beside] - speed * beside, speed, left_m, 1.0))
+            self._courses.append((self._beside_at(beside, speed), left_m, 1.0))
 
     def placed(self, index: int) -> list[Mesh]:
         """The cars within sight at a frame, in the street frame."""
         camera = self._route.T_street_camera[index, :3, 3]
-        # the one in the camera's lane keeps its distance, until it drives away
-        faster = max(0.0, index - self._leader_leaves) * 0.5 / STEP
-        leader = self._route.sample[index] + self._gap + faster
-        seen = {}
-        for number, (start, speed, left_m, way) in enumerate(
-            [(leader, 0.0, 0.0, 1.0), *self._courses]
-        ):
-            T_street_car = self._at(start + speed * index, left_m, way)
+        seen = []
+        for mesh, (samples, left_m, way) in zip(self._cars, self._courses, strict=True):
+            T_street_car = self._at(samples[index], left_m, way)
             # nearer only where the drive crosses itself
             if T_street_car is not None and (
                 2.6 < np.linalg.norm(T_street_car[:3, 3] - camera) < 120.0
             ):
-                seen[number] = T_street_car
-        return self._cars.placed(seen)
+                seen.append(mesh.placed(T_street_car))
+        return seen
 
     def _at(self, sample: float, left_m: float, sense: float) -> FloatArray | None:
         """``T_street_car`` at a lane sample, beside the lane; None beyond its ends."""

@@ -3,7 +3,17 @@
 import numpy as np
 
 from slam.simulation.geometry import Material
-from slam.simulation.texture import Axis, Lengths, Octave, Shader, Texels, cell_hash, grained, mix
+from slam.simulation.texture import (
+    Axis,
+    Lengths,
+    Octave,
+    Shader,
+    Texels,
+    cell_hash,
+    grained,
+    mix,
+    slabs,
+)
 
 
 def _asphalt(texels: Texels) -> Lengths:
@@ -37,15 +47,6 @@ def _junction(texels: Texels) -> Lengths:
     crack = 0.3 * np.clip(1.0 - 14.0 * line, 0.0, 1.0)
     rough = 1.0 - texels.parameters[5, 0]
     return texels.first * (1.0 + rough * grain - rough * patch - rough * crack)
-
-
-def _pavement(texels: Texels) -> Lengths:
-    slab = float(texels.parameters[0, 0])
-    near = np.clip(slab / texels.size / 2.0 - 0.5, 0.0, 1.0)
-    tone = (cell_hash(texels.u.at / slab, texels.v.at / slab, 1) - 0.5) * near * 0.3
-    grain = texels.fractal((4.0, 4.0, 0.2), (1.0, 1.0, 0.16), (0.25, 0.25, 0.2), (0.08, 0.08, 0.12))
-    joints = texels.joints(slab, slab, 0.035)
-    return mix(texels.first * (1.0 + grain + tone), 0.6 * texels.second, joints)
 
 
 def _kerb(texels: Texels) -> Lengths:
@@ -162,7 +163,9 @@ def _fence(texels: Texels) -> Lengths:
 STREET_SHADERS: dict[Material, Shader] = {
     "asphalt": _asphalt,
     "junction": _junction,
-    "pavement": _pavement,
+    "pavement": slabs(
+        0.3, (4.0, 4.0, 0.2), (1.0, 1.0, 0.16), (0.25, 0.25, 0.2), (0.08, 0.08, 0.12)
+    ),
     "kerb": _kerb,
     "grass": _mottled(
         (24.0, 24.0, 0.3), (8.0, 8.0, 0.35), (2.5, 2.5, 0.35), (0.7, 0.7, 0.4), (0.2, 0.2, 0.4)

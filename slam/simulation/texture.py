@@ -141,3 +141,23 @@ Shader = Callable[[Texels], Lengths]
 def grained(*octaves: Octave) -> Shader:
     """One colour under noise."""
     return lambda texels: texels.first * (1.0 + texels.fractal(*octaves))
+
+
+def slabs(contrast: float, *octaves: Octave) -> Shader:
+    """Square slabs of several tones under noise, between joints of the second colour.
+
+    Parameters of the texture: their side and the width of joints, metres, and whether they are
+    chequered.
+    """
+
+    def shade(texels: Texels) -> Lengths:
+        side, joint, checks = texels.parameters[:3]
+        u, v = texels.u.at / side, texels.v.at / side
+        near = np.clip(side / texels.size / 2.0 - 0.5, 0.0, 1.0)
+        tone = contrast * near * (cell_hash(u, v, 1) - 0.5)
+        rgb = texels.first * (1.0 + texels.fractal(*octaves) + tone)
+        chequered = (np.floor(u) + np.floor(v)) % 2 * checks * near
+        rgb = mix(rgb, 0.5 * texels.second, chequered)
+        return mix(rgb, texels.second, texels.joints(side, side, joint))
+
+    return shade

@@ -4,10 +4,10 @@ import numpy as np
 
 from slam.geometry import se3
 from slam.simulation import objects
-from slam.simulation.geometry import Bend, FloatArray, Mesh, luck, unit
+from slam.simulation.geometry import Bend, Mesh, luck
 from slam.simulation.open_land import open_land
 from slam.simulation.route import KERB, Node, StreetPlan
-from slam.simulation.shapes import Rectangle, Site, corners_of, directed, grid_over, lattice
+from slam.simulation.shapes import Rectangle, Site, grid_over, lattice
 
 LANE = 3.6  # width on a motorway, metres
 ROUNDING = 5.0  # radius of kerbs at corners, metres
@@ -20,7 +20,7 @@ def build_town(plan: StreetPlan, bend: Bend, seed: int, varied: bool = False) ->
         plan: the streets.
         bend: from the plan to street coordinates.
         seed: of the world.
-        varied: whether there are railings, posts and people as well.
+        varied: whether there are fences, posts and people as well.
     """
     rng = luck(seed, 10)
     town = _Town(plan, rng, luck(seed, 11) if varied else None)
@@ -30,7 +30,7 @@ def build_town(plan: StreetPlan, bend: Bend, seed: int, varied: bool = False) ->
             town.block(i, j)
     if plan.kind == "motorway":  # a barrier between the carriageways
         start, end = plan.xs[[0, -1]]
-        objects.barrier(town.site.at(start, 0.0), end - start, rng.random() < 0.5)
+        objects.barrier(town.site.moved(start), end - start, rng.random() < 0.5)
     town.backdrop()
     return town.site.finish(bend)
 
@@ -64,8 +64,8 @@ class _Town:
         lines = (plan.half_width, dash, fraction, edged, lanes, smooth)
         self.asphalt = site.instance("asphalt", grey, paint, lines)
         self.junction = site.instance("junction", grey, paint, lines)
-        slab = (rng.uniform(0.5, 1.2),)
-        self.pavement = site.instance("pavement", stone, 0.7, slab)
+        slab = rng.uniform(0.5, 1.2)
+        self.pavement = site.instance("pavement", stone, 0.42, (slab, 0.035))
         self.kerb = site.instance("kerb", 1.15 * stone, 0.6 * stone)
         self.grass = site.instance("grass", turf, 0.55)
         self.gravel = site.instance("gravel", 0.9 * stone, 0.5 * stone)
@@ -134,75 +134,65 @@ class _Town:
             open_land(self.site, plan.kind, self.grass, inner, sides)
             return
         self._slab(inner, KERB, self.grass if self.rng.random() < 0.7 else self.gravel)
-        corners = corners_of((x0, y0, x1, y1))
-        for side in np.flatnonzero(sides):
-            self._furnish(corners[side], corners[(side + 1) % 4])
+        for number in np.flatnonzero(sides):
+            self._furnish(*self.site.side((x0, y0, x1, y1), number))
         self._split(inner, inner, sides)
 
     def _pavement(self, outer: Rectangle, inner: Rectangle, sides: list[bool]) -> None:
         """A ring of paving between a rounded outline and the lots, and the kerb below its edge."""
-        rim, corners = [], corners_of(outer)
-        edges = np.roll(corners, -1, axis=0) - corners
-        for k, (here, ahead) in enumerate(zip(corners, unit(edges))):
-            radius = ROUNDING if sides[k] and sides[k - 1] else 0.01
-            back = -unit(edges)[k - 1]
+        rim = []
+        for number in range(4):
+            edge, length = self.site.side(outer, number)
+            radius = ROUNDING if sides[number] and sides[number - 1] else 0.01
             for angle in np.linspace(0.0, np.pi / 2.0, 6):
-                rim.append(
-                    here + radius * ((1.0 - np.sin(angle)) * back + (1.0 - np.cos(angle)) * ahead)
-                )
-            reach = np.linalg.norm(edges[k]) - ROUNDING - 1.0
-            rim += [here + along * ahead for along in np.arange(ROUNDING + 2.0, reach, 2.5)]
-        edge = np.stack([*rim, rim[0]])
-        inside = np.clip(edge, [inner[0], inner[1]], [inner[2], inner[3]])
-        ring = np.pad(np.stack([edge, inside]), ((0, 0), (0, 0), (0, 1)), constant_values=KERB)
+                along, across = radius * (1.0 - np.array([np.cos(angle), np.sin(angle)]))
+                rim.append(edge.moved(along, across))
+            rim += map(edge.moved, np.arange(ROUNDING + 2.0, length - ROUNDING - 1.0, 2.5).tolist())
+        outline = np.stack([spot.origin for spot in [*rim, rim[0]]])[:, :2]
+        inside = np.clip(outline, [inner[0], inner[1]], [inner[2], inner[3]])
+        ring = np.pad(np.stack([outline, inside]), ((0, 0), (0, 0), (0, 1)), constant_values=KERB)
         self.site.patch(ring, ring[..., :2], self.pavement)
-        length = se3.distance_along(edge)
+        around = se3.distance_along(outline)
         step = ring[[0, 0]].copy()
         step[0, :, 2] = -0.1
-        self.site.patch(step, lattice(length, (-0.1, KERB)), self.kerb)
+        self.site.patch(step, lattice(around, (-0.1, KERB)), self.kerb)
         lip = ring[[0, 0]].copy()
         lip[..., 2] += 0.004
-        towards = inside - edge
+        towards = inside - outline
         lip[1, :, :2] += (
             0.16 * towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 0.16)
         )
-        self.site.patch(lip, lattice(length, (0.0, 0.16)), self.kerb)
+        self.site.patch(lip, lattice(around, (0.0, 0.16)), self.kerb)
 
-    def _furnish(self, start: FloatArray, end: FloatArray) -> None:
+    def _furnish(self, kerb: Site, length: float) -> None:
         """Trees, lamps and signs along a kerb with its block on the left, and cars before it."""
         rng = self.rng
-        length, ahead, inward, angle = directed(start, end)
         along = 6.0
         while along < length - 6.0:
-            x, y = start + along * ahead + rng.uniform(0.55, 1.0) * inward
-            spot = self.site.at(x, y)
+            spot = kerb.moved(along, rng.uniform(0.55, 1.0))
             kind = rng.random()
             if kind < 0.45 * self.greenery:
                 objects.tree(spot, rng.uniform(4.0, 8.0) * self.tallness)
             elif kind < 0.55:
-                objects.lamp(spot, -inward)
+                objects.lamp(spot)
             elif kind < 0.72:
-                objects.sign(spot.at(x, y, angle - np.pi / 2.0))
+                objects.sign(spot)
             along += rng.uniform(4.0, 11.0)
         along = 6.5
         while along < length - 6.5:
             if rng.random() < self.parking:
-                x, y = start + along * ahead - 0.95 * inward
-                objects.car(self.site.at(x, y, angle + rng.normal(0.0, 0.03)))
+                objects.car(kerb.moved(along, -0.95, turn=rng.normal(0.0, 0.03)))
             along += rng.uniform(5.4, 7.5)
         if self.more is None:
             return
-        # a railing along a part of the kerb, thin posts, and people on the pavement
-        rng = self.more
-        site = self.site.drawn_by(rng)
+        # a fence along a part of the kerb, thin posts, and people on the pavement
+        rng, kerb = self.more, kerb.drawn_by(self.more)
         if rng.random() < 0.45 and length > 16.0:
             first, last = np.sort(rng.uniform(6.0, length - 6.0, 2))
-            x, y = start + first * ahead + rng.uniform(0.2, 0.8) * inward
-            objects.railing(site.at(x, y, angle, KERB), last - first)
+            objects.fence(kerb.moved(first, rng.uniform(0.2, 0.8), KERB), last - first)
         for _ in range(rng.poisson(length / 14.0)):
-            walked = rng.uniform(5.0, max(length - 5.0, 6.0))
-            x, y = start + walked * ahead + rng.uniform(-0.8, 1.6) * inward
-            (objects.person if rng.random() < 0.6 else objects.post)(site.at(x, y))
+            spot = kerb.moved(rng.uniform(5.0, max(length - 5.0, 6.0)), rng.uniform(-0.8, 1.6))
+            (objects.person if rng.random() < 0.6 else objects.post)(spot)
 
     def _split(self, lot: Rectangle, inner: Rectangle, sides: list[bool]) -> None:
         """Cut a lot in two until each piece is of the size of a house."""
@@ -227,37 +217,30 @@ class _Town:
             side = facing[0] if facing else 0
             front = rng.uniform(0.0, 3.0) if facing else 1.0
             gap = rng.choice([0.02, rng.uniform(0.4, 1.6)])
-            width, depth = (x1 - x0, y1 - y0) if side % 2 == 0 else (y1 - y0, x1 - x0)
+            place, width = self.site.side(lot, side)
+            _, depth = self.site.side(lot, side + 1)
             deep = min(depth - front - 0.2, rng.uniform(7.0, 14.0))
-            house = self._along(lot, side, self.foot).moved(gap, front)
-            objects.building(house, width - 2 * gap, deep)
+            objects.building(place.moved(gap, front, self.foot), width - 2 * gap, deep)
             if front > 1.4 and rng.random() < 0.5:
-                objects.hedge(self._along(lot, side, KERB - 0.05), 0.6 * width)
+                objects.hedge(place.moved(0.0, up=KERB - 0.05), 0.6 * width)
             return
         for side in facing:
+            place, width = self.site.side(lot, side)
             if rng.random() < 0.6:
-                length = (x1 - x0 if side % 2 == 0 else y1 - y0) * rng.uniform(0.5, 1.0)
-                objects.hedge(self._along(lot, side, KERB - 0.05), length)
+                objects.hedge(place.moved(0.0, up=KERB - 0.05), width * rng.uniform(0.5, 1.0))
         for _ in range(rng.poisson(3.0 * self.greenery)):
             x, y = rng.uniform(x0 + 1.5, x1 - 1.5), rng.uniform(y0 + 1.5, y1 - 1.5)
-            objects.tree(self.site.at(x, y), rng.uniform(4.0, 10.0))
-
-    def _along(self, lot: Rectangle, side: int, z: float) -> Site:
-        """The place along a side of a lot, counterclockwise from the south."""
-        x, y = corners_of(lot)[side]
-        return self.site.at(x, y, side * np.pi / 2.0, z)
+            objects.tree(self.site.moved(x, y), rng.uniform(4.0, 10.0))
 
     def backdrop(self) -> None:
         """Trees and houses beyond the edge of town, so that no street ends in the sky."""
         rng, xs, ys = self.rng, self.plan.xs, self.plan.ys
-        corners = corners_of((xs[0], ys[0], xs[-1], ys[-1]))
-        for side, start in enumerate(corners):
-            length, ahead, inward, _ = directed(start, corners[(side + 1) % 4])
-            for along in np.arange(0.0, length, 9.0):
-                sideways = (along + rng.uniform(-3, 3)) * ahead
-                x, y = start + sideways - rng.uniform(6.0, 25.0) * inward
+        for number in range(4):
+            edge, length = self.site.side((xs[0], ys[0], xs[-1], ys[-1]), number)
+            for along in np.arange(0.0, length, 9.0).tolist():
+                spot = edge.moved(along + rng.uniform(-3, 3), -rng.uniform(6.0, 25.0))
                 if rng.random() < (1.0 if self.open else 0.7):
-                    objects.tree(self.site.at(x, y), rng.uniform(6.0, 13.0))
+                    objects.tree(spot, rng.uniform(6.0, 13.0))
                 else:
-                    house = self.site.at(x, y, side * np.pi / 2.0 + np.pi, -0.3)
+                    house = spot.moved(0.0, up=-0.3, turn=np.pi)
                     objects.building(house, rng.uniform(8, 14), rng.uniform(7, 11))

@@ -24,7 +24,6 @@ from slam.simulation.texture import Axis, Texels
 
 FARTHEST_M = 200.0  # surfaces beyond are treated as sky
 SHADERS = STREET_SHADERS | ROOM_SHADERS
-SHUTTER = 0.5  # exposure time of a blurred image over the frame interval
 
 
 class Surface:
@@ -56,6 +55,13 @@ def place_rays(T_scene_sensor: FloatArray, directions: Float32Array) -> Float32A
     return rays.reshape(-1, 6)
 
 
+def between(corners: Float32Array, barycentric: Float32Array) -> Float32Array:
+    """Values at points of triangles by those of the three corners ``(3, ..., N)``, ``(..., N)``."""
+    first, second, third = corners
+    b1, b2 = barycentric
+    return first + b1 * (second - first) + b2 * (third - first)
+
+
 @dataclass(frozen=True)
 class Hits:
     """Rays that met a surface."""
@@ -74,8 +80,7 @@ class Hits:
         mesh = self.surface.mesh
         u_size, v_size = self._footprint(self.depth / np.float32(focal_px))
         corners = np.take(mesh.uv, self.triangle, axis=2)  # (3, 2, N)
-        b1, b2 = self.barycentric
-        u, v = corners[0] + b1 * (corners[1] - corners[0]) + b2 * (corners[2] - corners[0])
+        u, v = between(corners, self.barycentric)
         instances = np.take(mesh.instance, self.triangle)
         materials = np.take(mesh.material, self.triangle)
         rgb = np.empty((3, len(self.triangle)), dtype=np.float32)
@@ -158,11 +163,12 @@ class SimulatedWorld(ABC):
         """Colour of hits, RGB about [0, 1], ``(3, N)``; the surfaces are all of the frame."""
 
     @abstractmethod
-    def _exposures(self, index: int) -> FloatArray:
-        """Poses from which the image is taken, which is their mean.
+    def _poses(self, seconds: FloatArray) -> FloatArray:
+        """``T_scene_camera`` at times ``(N,)`` of the drive, ``(N, 4, 4)``; its ends are held."""
 
-        They are ``(S, 4, 4)``, or ``(S, H, 4, 4)`` with one a row.
-        """
+    @abstractmethod
+    def _shutter(self, index: int) -> tuple[float, int]:
+        """How long the shutter is open for a blurred frame, seconds, and of how many images."""
 
     @abstractmethod
     def _develop(self, rgb: Float32Array, index: int) -> Float32Array:
@@ -174,16 +180,25 @@ class SimulatedWorld(ABC):
 
     def render(self, index: int) -> NDArray[np.uint8]:
         """RGB image ``(H, W, 3)`` of one frame; the same index gives the same bytes."""
-        self._require(index)
         surfaces = self._surfaces(index)
         views = [self._view(surfaces, T_scene_camera) for T_scene_camera in self._exposures(index)]
-        rgb = views[0] if len(views) == 1 else np.mean(views, axis=0)
-        levels = self._develop(rgb, index) * np.float32(255.0) + np.float32(0.5)
+        levels = self._develop(np.mean(views, axis=0), index) * np.float32(255.0) + np.float32(0.5)
         return np.clip(levels, 0.0, 255.0).astype(np.uint8)
+
+    def _exposures(self, index: int) -> FloatArray:
+        """Poses ``(S, R, 4, 4)`` of the images whose mean a frame is, one a row or one for all."""
+        offsets, options = np.zeros((1, 1)), self.options
+        if "blur" in options.hazards:
+            open_s, samples = self._shutter(index)
+            offsets = open_s * ((np.arange(samples)[:, None] + 0.5) / samples - 0.5)
+        if options.readout_s:
+            rows = (np.arange(options.height) + 0.5) / options.height - 0.5
+            offsets = offsets + options.readout_s * rows
+        poses = self._poses(index / options.rate + offsets.ravel())
+        return poses.reshape(*offsets.shape, 4, 4)
 
     def depth(self, index: int) -> Float32Array:
         """The z-depth of one frame in metres, 0 where nothing was hit, ``(H, W)``."""
-        self._require(index)
         rays = place_rays(self._T_scene_camera[index], self._rays)
         depth: Float32Array = np.min(
             [surface.cast(rays)["t_hit"] for surface in self._surfaces(index)], axis=0
@@ -217,7 +232,14 @@ class SimulatedWorld(ABC):
     def _view(self, surfaces: list[Surface], T_scene_camera: FloatArray) -> Float32Array:
         """Colour ``(H, W, 3)``, about [0, 1], from a pose, or one a row."""
         rays = place_rays(T_scene_camera, self._rays)  # z = 1, so that t is z-depth
-        unit = np.ascontiguousarray(rays[:, 3:].T) / self._stretch  # (3, H * W)
+        rgb = self._colours(surfaces, rays, self._stretch)
+        return rgb.reshape(self.options.height, self.options.width, 3)
+
+    def _colours(
+        self, surfaces: list[Surface], rays: Float32Array, stretch: Float32Array
+    ) -> Float32Array:
+        """Colour along rays ``(N, 6)`` whose directions have lengths ``(N,)``, ``(N, 3)``."""
+        unit = np.ascontiguousarray(rays[:, 3:].T) / stretch  # (3, N)
         answers = [surface.cast(rays) for surface in surfaces]
         depths = np.stack([answer["t_hit"] for answer in answers])
         nearest, depth = np.argmin(depths, axis=0), depths.min(axis=0)
@@ -235,13 +257,7 @@ class SimulatedWorld(ABC):
                 surface, triangle, barycentric, rays[seen], directions, normals, depth[seen], seen
             )
             rgb[seen] = self._shade(hits, surfaces).T
-        return rgb.reshape(self.options.height, self.options.width, 3)
-
-    def _require(self, index: int) -> None:
-        if not 0 <= index < len(self):
-            raise IndexError(
-                f"the simulated drive has frames 0 to {len(self) - 1}; asked for {index}"
-            )
+        return rgb
 
 
 def square_camera(width: int, height: int, fov_deg: float) -> Intrinsics:

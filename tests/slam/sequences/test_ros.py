@@ -247,25 +247,10 @@ def test_damaged_bags_are_named_in_one_line(new_bag: NewBag, kind: str):
 def test_an_mcap_of_another_program_is_named_and_converted_as_advised(
     tmp_path: Path, new_bag: NewBag
 ):
-    def record(kind: int, content: bytes) -> bytes:
-        return struct.pack("<BQ", kind, len(content)) + content
-
-    def text(words: str) -> bytes:
-        return struct.pack("<I", len(words)) + words.encode()
-
-    magic = b"\x89MCAP0\r\n"
-    start = magic + record(1, text("") + text("test"))
-    schema = record(
-        3, struct.pack("<H", 1) + text("foxglove.RawImage") + text("jsonschema") + text("{}")
-    )
-    channel = record(
-        4, struct.pack("<HH", 1, 1) + text("/cam") + text("json") + struct.pack("<I", 0)
-    )
-    footer = record(2, struct.pack("<QQI", len(start), 0, 0))
-    (tmp_path / "walk.mcap").write_bytes(start + schema + channel + footer + magic)
-    with pytest.raises(
-        SequenceError, match=r"holds /cam \(foxglove.RawImage, json\); convert it to a bag of ROS 2"
-    ):
+    header = bytes(4) + struct.pack("<I", 4) + b"test"  # no profile, and the library
+    start = b"\x89MCAP0\r\n" + struct.pack("<BQ", 1, len(header)) + header
+    (tmp_path / "walk.mcap").write_bytes(start + bytes(40))
+    with pytest.raises(SequenceError, match=r"Profile is not ros2.*convert it to a bag of ROS 2"):
         open_sequence(tmp_path / "walk.mcap")
     converted = new_bag("mcap", "converted")
     drive(converted)

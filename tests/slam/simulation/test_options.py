@@ -11,7 +11,7 @@ def test_varieties_cover_streets_and_cameras():
         ([one.fov_deg for one in drawn], 50.0, 110.0),
         ([one.height_m for one in drawn], 0.5, 2.5),
         ([np.rad2deg(one.roll) for one in drawn], -2.0, 2.0),
-        ([one.steepness for one in drawn], 0.0, 0.1),
+        ([one.hills[0] for one in drawn], 0.0, 0.1),
     ):
         assert (
             low <= min(values) < low + 0.1 * (high - low)

@@ -83,7 +83,7 @@ def choose_device(choice: str) -> Device:
 def _may_have_gpu() -> bool:
     """Whether PyTorch was built for one and a driver is there; otherwise it need not be imported to be asked."""
     has_driver = any(Path("/dev", name).exists() for name in _GPU_DRIVERS) or find_library("cuda")
-    return not version("torch").endswith("+cpu") and bool(has_driver or find_library("nvcuda"))
+    return not version("torch").endswith("+cpu") and bool(has_driver)
 
 
 @lru_cache(maxsize=1)

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from erfsfm.common import command_line
+from erfsfm.common.command_line import Device, Json, Overrides, Seed, UnusedSeed
 from erfsfm.common.errors import ConfigError, DataError, ErfsfmError
 from erfsfm.common.progress import progress_bar
 from erfsfm.common.table import Table, table_of
@@ -29,11 +30,6 @@ evaluate_app = typer.Typer(
 )
 app.add_typer(evaluate_app, name="evaluate")
 
-Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="where to compute")]
-Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of the random numbers")]
-UnusedSeed = Annotated[
-    int, typer.Option("--seed", hidden=True, help="accepted for old scripts; nothing is random")
-]
 Weights = Annotated[
     str, typer.Option(help="a shipped name (default, sim) or a training output folder")
 ]
@@ -43,7 +39,6 @@ ManyWeights = Annotated[
         help="a shipped name (default, sim) or a training output folder; repeat to compare"
     ),
 ]
-Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
 Fidelity = Annotated[
     Literal["default", "paper"], typer.Option(help="paper: exactly as the reference code")
 ]
@@ -78,9 +73,7 @@ def train(
     resume: Annotated[
         bool, typer.Option("--resume", help="resume from the last checkpoint in OUTPUT")
     ] = False,
-    overrides: Annotated[
-        list[str] | None, typer.Option("--set", help="section.key=value; repeat")
-    ] = None,
+    overrides: Overrides = None,
     seed: Annotated[int | None, typer.Option(help="overrides training.seed")] = None,
     device: Device = "auto",
 ) -> None:

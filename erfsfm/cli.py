@@ -332,14 +332,12 @@ def predict(
     import numpy as np
 
     from erfsfm.common.files import write_atomically
-    from erfsfm.common.readers.images import list_images, read_image, report_unreadable
+    from erfsfm.common.readers.images import images_at, read_image, report_unreadable
     from erfsfm.inference import DepthPosePredictor, colour_disparity
 
     if output.is_file():
         raise DataError(f"{output} is a file: give a folder as --output")
-    files = list_images(images) if images.is_dir() else [images]
-    if not files:
-        raise DataError(f"{images} holds no png or jpg to predict from")
+    files = images_at(images)
     if output.resolve() in {file.parent.resolve() for file in files}:
         raise DataError(
             f"{output} holds the images themselves: choose another --output, or they would be overwritten"
@@ -429,7 +427,7 @@ def receptive_field(
 
     from erfsfm.checkpoint import load_model
     from erfsfm.common.files import require_figure
-    from erfsfm.common.readers.images import list_images, resize_image
+    from erfsfm.common.readers.images import images_at, resize_image
     from erfsfm.inference import choose_device, read_image
     from erfsfm.networks.presets import PRESETS
     from erfsfm.receptive_field import draw_fields, field_table, measure_fields, street_snippet
@@ -438,7 +436,7 @@ def receptive_field(
     if images is None:
         snippet = street_snippet(5, height, width)
     else:
-        files = list_images(images)[:5] if images.is_dir() else []
+        files = images_at(images)[:5]
         if len(files) < 5:
             raise DataError(
                 f"--images needs a folder of five consecutive images; {images} has {len(files)}"

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
 
+_POLL_S = 0.5
+_GIB = 2**30
 _MOST_SAID = 20_000  # bytes of its standard error that are searched for the reason
 
 S = TypeVar("S")
@@ -58,6 +60,7 @@ def slam_process(
     folder: Path | None = None,
     log: Path | None = None,
     threads: int = 0,
+    memory_gib: float = 0.0,
     program: Sequence[str] = ("slam",),
     variables: Mapping[str, str] | None = None,
 ) -> str:
@@ -68,6 +71,7 @@ def slam_process(
         folder: from which its paths are seen.
         log: file that its standard error is added to.
         threads: of libraries; 0 as they like.
+        memory_gib: where it needs more, it is ended; 0 for no limit.
         program: module that is run, with words before the arguments.
         variables: of its environment, beside those of this process.
     """
@@ -84,17 +88,37 @@ def slam_process(
             stderr=said,
         )
         try:
-            code = process.wait()
+            exceeded = _watch(process, memory_gib)
         finally:
             process.kill()
             process.wait()
         said.seek(max(said.seek(0, os.SEEK_END) - _MOST_SAID, 0))
         lines = said.read().decode(errors="replace").strip().splitlines()
-    if code == 0:
-        return ""
+    code = process.returncode
+    if exceeded or code == 0:
+        return exceeded
     if code < 0:
         return f"killed by {signal.Signals(-code).name}"
     return lines[-1].removeprefix("erfsfm-slam: ") if lines else f"exit code {code}"
+
+
+def _watch(process: subprocess.Popen[bytes], memory_gib: float) -> str:
+    """Wait for a process; a reason where it used too much memory and is to be ended."""
+    while True:
+        try:
+            process.wait(_POLL_S)
+            return ""
+        except subprocess.TimeoutExpired:
+            used = 0.0
+            with suppress(
+                OSError, IndexError, ValueError
+            ):  # it has ended, or the system tells nothing
+                pages = int(
+                    Path(f"/proc/{process.pid}/statm").read_text(encoding="ascii").split()[1]
+                )
+                used = pages * os.sysconf("SC_PAGE_SIZE") / _GIB
+            if 0 < memory_gib < used:
+                return f"it used {used:.1f} GiB of memory, more than the {memory_gib:.1f} GiB of --memory"
 
 
 def usable_cores() -> int:

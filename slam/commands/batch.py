@@ -153,6 +153,7 @@ def run_drives(
     scheduler: str | None,
     progress: Progress,
     threads: int | None = None,
+    memory_gib: float = 0.0,
 ) -> list[Outcome]:
     """Run drives, and write ``drives.csv``; one outcome a drive, in their order.
 
@@ -163,6 +164,7 @@ def run_drives(
         scheduler: address of a Dask scheduler in place of this machine.
         progress: is told how many have ended.
         threads: of a drive; None for the cores of this machine by the workers.
+        memory_gib: that a drive may use; 0 for all.
 
     Raises:
         SlamError: a folder with files of others, or no such scheduler.
@@ -170,7 +172,7 @@ def run_drives(
     check_output(output, drives)
     output.mkdir(parents=True, exist_ok=True)
     threads = threads or (0 if scheduler else max((os.cpu_count() or 1) // count, 1))
-    work = partial(run_drive, output=output.absolute(), threads=threads)
+    work = partial(run_drive, output=output.absolute(), threads=threads, memory_gib=memory_gib)
     outcomes: dict[int, Outcome] = {}
     progress("drives", 0, len(drives))
     for number, result in spread(work, drives, min(count, len(drives)), scheduler):
@@ -226,7 +228,7 @@ def spread(
             yield numbers[future.key], future.exception() or future.result()
 
 
-def run_drive(drive: Drive, output: Path, threads: int = 0) -> Outcome:
+def run_drive(drive: Drive, output: Path, threads: int = 0, memory_gib: float = 0.0) -> Outcome:
     """Run one drive to ``output/<name>``, unless the same command left a whole run there."""
     folder = output / drive.name
     arguments = ["run", *drive.arguments, "--output", str(folder)]
@@ -236,7 +238,7 @@ def run_drive(drive: Drive, output: Path, threads: int = 0) -> Outcome:
     log = output / f"{drive.name}.log"
     log.write_text(shlex.join(["erfsfm-slam", *arguments]) + "\n", encoding="utf-8")
     program = ("slam.commands.batch", str(output / f".{drive.name}.lock"))
-    reason = slam_process(arguments, drive.folder, log, threads, program)
+    reason = slam_process(arguments, drive.folder, log, threads, memory_gib, program)
     if not reason and not _is_whole(folder, arguments):
         reason = "it ended well and left no whole run: leave out options that only ask something"
     return Outcome(drive, folder, "failed" if reason else "whole", reason)

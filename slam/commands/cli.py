@@ -130,6 +130,9 @@ def batch(
             min=1, help="threads of a drive; default: the cores of this machine by the workers"
         ),
     ] = None,
+    memory: Annotated[
+        float, typer.Option(min=0, help="GiB that a drive may use; 0: all (Linux)")
+    ] = 0.0,
     weights: Annotated[str | None, typer.Option(help="as for run")] = None,
     config: Config = None,
     overrides: Overrides = None,
@@ -143,10 +146,12 @@ def batch(
     """
     from slam.commands.batch import CSV, drives_of, options_of_drives, run_drives, summary_table
 
+    if memory and not Path("/proc/self/statm").exists():
+        raise SlamError("--memory needs Linux: leave it out here")
     options = options_of_drives(weights, config, overrides or [], frames, seed, device)
     planned = drives_of(drives, sequence or ["all"], options)
     with progress_bar() as progress:
-        outcomes = run_drives(planned, output, workers, scheduler, progress, threads)
+        outcomes = run_drives(planned, output, workers, scheduler, progress, threads, memory)
     summary_table(outcomes).print()
     failed = [outcome for outcome in outcomes if outcome.status == "failed"]
     kept = sum(outcome.status == "kept" for outcome in outcomes)
@@ -176,6 +181,7 @@ def evaluate(
         Path | None,
         typer.Option(help="of the rows of KITTI files, as times.txt: compared by stamps"),
     ] = None,
+    csv: Annotated[Path | None, typer.Option(help="all numbers, with --reference")] = None,
     fail_over: Annotated[
         list[str] | None, typer.Option(help="METRIC=VALUE: exit 1 if it is larger; repeat")
     ] = None,
@@ -196,9 +202,9 @@ def evaluate(
     files, limits = [Path(path) for path in paths], fail_over or []
     evaluation.require_metrics(limits)
     if reference is not None:
-        evaluation.against_reference(paths, reference, frames, format, limits, as_json, times)
-    elif frames:
-        raise typer.BadParameter("it needs --reference FILE", param_hint="--frames")
+        evaluation.against_reference(paths, reference, frames, format, limits, as_json, csv, times)
+    elif frames or csv:
+        raise typer.BadParameter("--frames and --csv need --reference FILE")
     elif all(path.is_dir() for path in files):
         if limits:
             raise typer.BadParameter(
@@ -405,6 +411,39 @@ def calibrate(
         lines = calibrate_camera(recording, wanted, model, output, fps, progress)
     for line in lines:
         typer.echo(line)
+
+
+@app.command()
+def download(
+    data_set: Annotated[Literal["kitti-odometry"], typer.Argument(help="the data set")],
+    sequence: Annotated[str, typer.Option("--sequence", "-s", help="such as 09")],
+    to: Annotated[Path, typer.Option(help="folder that gets it")],
+    camera: Annotated[Literal["colour", "grey"], typer.Option(help="which images")] = "colour",
+    lidar: Annotated[bool, typer.Option("--lidar", help="scans as well")] = False,
+    accept_licence: Annotated[
+        bool, typer.Option("--accept-licence", help="you accept the licence that is shown")
+    ] = False,
+    mirror: Annotated[
+        str | None, typer.Option(help="address of the archives, in place of the official one")
+    ] = None,
+) -> None:
+    """One sequence of KITTI odometry from its official server.
+
+    Of its archives only the files of the sequence are fetched. Run again, an interrupted download goes on.
+
+    Example: erfsfm-slam download kitti-odometry --sequence 09 --to KITTI
+    """
+    from slam.commands.download import LICENCE, SERVER, download_kitti
+
+    typer.echo(LICENCE)
+    if not accept_licence:
+        if not sys.stdin.isatty():
+            raise SlamError("the licence above is to be accepted: give --accept-licence")
+        if not typer.confirm("Do you accept it?"):
+            raise SlamError("the licence was not accepted: nothing is downloaded")
+    with progress_bar() as progress:
+        count = download_kitti(sequence, to, mirror or SERVER, camera == "grey", lidar, progress)
+    typer.echo(f"{count} files in {to}: erfsfm-slam run --dataset {to} --sequence {sequence}")
 
 
 @app.command()

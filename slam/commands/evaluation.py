@@ -1,8 +1,9 @@
-"""Errors of trajectories or of whole runs against a truth, as a table or as JSON."""
+"""Errors of trajectories or of whole runs against a truth, as a table, as JSON or as CSV."""
 
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from glob import glob
@@ -13,14 +14,17 @@ import numpy as np
 import typer
 
 from erfsfm.common.readers.numbering import in_order
-from erfsfm.common.table import Table
+from erfsfm.common.table import Table, csv_of
+from slam.evaluation.mistakes import likely_mistakes
 from slam.evaluation.trajectory import TrajectoryMetrics, evo_commands, exceeded, trajectory_metrics
 from slam.formats.trajectory import Trajectory, associate, read_trajectory
 from slam.results import tables
-from slam.results.folder import RunFolder
+from slam.results.folder import RunFolder, check_replaced
 from slam.runtime.errors import ConfigError, RunError, SlamError, TrajectoryError
-from slam.runtime.files import REFERENCE, trajectory_file
+from slam.runtime.files import REFERENCE, trajectory_file, write_atomically
 from slam.sequences.recording import frame_range, read_stamps
+
+logger = logging.getLogger(__name__)
 
 
 def require_metrics(limits: Sequence[str]) -> None:
@@ -38,10 +42,15 @@ def against_reference(
     format: str,
     limits: Sequence[str],
     as_json: bool,
+    csv: Path | None,
     times: Path | None = None,
 ) -> None:
     """Any number of trajectories against one truth, as a table of systems; `SlamError` where one is over its limit."""
+    if csv is not None:
+        check_replaced(csv, b"system,path")
     runs = compare(named_paths(paths), reference, format, frames, times)
+    if csv is not None:
+        write_atomically(csv, csv_of(dict(_flat(run.tree())) for run in runs), RunError)
     if as_json:
         typer.echo(json.dumps([run.tree() for run in runs], indent=2))
     else:
@@ -183,6 +192,9 @@ def compare(
             pair = associate(estimate, truth, chosen)
         except TrajectoryError as error:
             raise TrajectoryError(f"{path}: {error}") from error
+        for mistake in likely_mistakes(estimate, truth, pair):
+            line = f"{path}: {mistake}"
+            logger.warning(line)
         runs.append(SystemRun(name, path, len(pair[0]), trajectory_metrics(*pair)))
     return runs
 
@@ -204,3 +216,12 @@ def _spread(column: tables.ErrorColumn, runs: Sequence[SystemRun]) -> str:
         return tables.written(values[0] if values else None, column.decimals)
     mean, deviation = float(np.mean(values)), float(np.std(values, ddof=1))
     return f"{tables.written(mean, column.decimals)} ± {tables.written(deviation, column.decimals)}"
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Numbers by their dotted paths, without reasons."""
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        elif not key.endswith("_reason"):
+            yield prefix + key, value

@@ -15,6 +15,10 @@ from slam.runtime.errors import SlamError
 # of each optional extra: what needs it, and its modules
 EXTRAS: dict[str, tuple[str, tuple[str, ...]]] = {
     "cluster": ("several workers and schedulers need Dask", ("distributed",)),
+    "download": (
+        "download needs remotezip and requests",
+        ("remotezip", "requests", "urllib3.exceptions"),
+    ),
     "rerun": ("--rerun and --view need rerun", ("rerun",)),
     "ros": ("bags need rosbags", ("rosbags.rosbag1", "rosbags.rosbag2", "rosbags.typesys")),
 }

@@ -82,6 +82,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
         r"--config default-gpu ",
         "it wants hours of labels, and a GPU; tests/erfsfm/data/test_prepared.py has small data",
     ),
+    (r"^erfsfm-slam download ", "it downloads; tests/slam/commands/downloads has a server"),
     (
         r"^erfsfm-slam calibrate ",
         "it wants images of a board; tests/slam/commands/test_calibration.py renders them",

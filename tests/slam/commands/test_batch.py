@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -141,17 +142,21 @@ def test_failures_are_told_apart_and_whole_runs_are_kept(
     assert (output / "good" / "metrics.json").stat().st_mtime_ns == written
 
 
-def test_what_a_run_left_that_was_ended_before_its_map_is_no_whole_run(tmp_path: Path):
-    drive = Drive("sim", tmp_path, ("--dataset", "nowhere"))
+def test_a_drive_that_needs_too_much_memory_is_ended(
+    kitti_root: Path, tiny_weights: Path, tmp_path: Path
+):
+    """What an earlier run left, which was ended before its map, is no whole run."""
+    (sim,) = drives_of(
+        kitti_root, ["all"], [*QUICK, "--weights", str(tiny_weights), "--frames", "0:6"]
+    )
     (tmp_path / "sim").mkdir()
-    command = f"erfsfm-slam run --dataset nowhere --output {tmp_path / 'sim'}"
-    ran = {"command": command, "weights_sha256": "0"}
-    ended = {"schema": 1, "status": "estimated", "provenance": ran}
+    command = shlex.join(["erfsfm-slam", "run", *sim.arguments, "--output", str(tmp_path / "sim")])
+    ended = {"status": "estimated", "provenance": {"command": command}}
     (tmp_path / "sim" / "metrics.json").write_text(json.dumps(ended))
-    (outcome,) = run_drives([drive], tmp_path, 1, None, silent, threads=1)
-    assert outcome.status == "failed" and "no data set at nowhere" in outcome.reason
-    assert "no data set at nowhere" in (tmp_path / "drives.csv").read_text()
-    check_output(tmp_path, [drive])
+    (outcome,) = run_drives([sim], tmp_path, 1, None, silent, threads=1, memory_gib=0.05)
+    assert outcome.status == "failed" and "more than the 0.1 GiB of --memory" in outcome.reason
+    assert "more than the 0.1 GiB" in (tmp_path / "drives.csv").read_text()
+    check_output(tmp_path, [sim])
 
 
 def test_paths_of_the_command_line_are_seen_from_where_it_is_given(

@@ -76,7 +76,7 @@ def test_help_of_every_verb_is_light():
         "run --seed -1",
         "evaluate a.txt b.txt c.txt",
         "evaluate . --fail-over a=1",
-        "evaluate . --frames 0:9",
+        "evaluate . --csv a",
     ],
 )
 def test_wrong_usage_exits_with_2(call: Call, words: str):
@@ -242,15 +242,23 @@ def test_evaluate_runs_side_by_side(call: Call, make_run: MakeRun):
 
 
 def test_evaluate_systems_against_one_reference(call: Call, make_run: MakeRun):
-    """Files and runs in one table; several of one name as mean and deviation; frames."""
+    """Files and runs in one table; several of one name as mean and deviation; frames and CSV."""
     run = make_run("ours")
     for k in range(3):
         text = (run.path / "trajectory_optimised.kitti.txt").read_text().splitlines(keepends=True)
         Path(f"orb_{k}.txt").write_text("".join(text[: len(text) // 2 if k == 2 else None]))
     truth = run.path / "reference.kitti.txt"
     rows = len(truth.read_text().splitlines())
-    code, out, err = call("evaluate", run.path, "orb=orb_[01].txt", "--reference", truth)
+    code, out, err = call(
+        "evaluate", run.path, "orb=orb_[01].txt", "--reference", truth, "--csv", "a.csv"
+    )
     assert (code, err) == (0, "") and "orb (2 runs)" in out and " ± 0.000" in out
+    lines = Path("a.csv").read_text().splitlines()
+    assert (
+        len(lines) == 4
+        and lines[0].startswith("system,path,poses,")
+        and "align.6dof.t_rel_percent" in lines[0]
+    )
     code, _, err = call("evaluate", "orb_2.txt", "--reference", truth)
     assert code == 1 and "orb_2.txt: the estimate has" in err and "--frames A:B" in err
     arguments = (
@@ -283,6 +291,8 @@ def test_evaluate_systems_against_one_reference(call: Call, make_run: MakeRun):
     assert call("evaluate", "orb=orb [1].txt", "--reference", truth)[0] == 0
     code, _, err = call("evaluate", "/dev/urandom", "--reference", truth)
     assert code == 1 and "/dev/urandom: larger than" in err
+    code, _, err = call("evaluate", run.path, "--reference", truth, "--csv", "orb_0.txt")
+    assert code == 1 and "choose another" in err
 
 
 def test_the_printed_configuration_reads_back(call: Call):

@@ -141,7 +141,8 @@ def test_lines_from_before_the_folder_are_kept_and_failures_are_written_here_alo
     with run_log() as log:
         LOGGER.info("checked")
         log.begin(tmp_path / "run.log")
-        LOGGER.info("frame %d failed: %s", 0, "no road")
+        for frame in range(9):
+            LOGGER.info("frame %d failed: %s", frame, "no road")
         log.failed("no space")
     LOGGER.warning("after it")
     lines = (tmp_path / "run.log").read_text().splitlines()
@@ -149,6 +150,7 @@ def test_lines_from_before_the_folder_are_kept_and_failures_are_written_here_alo
         "INFO slam.test: checked",
         "INFO slam.test: frame 0 failed: no road",
         "ERROR slam.commands.run: the run failed: no space",
+        "INFO slam.commands.run: 9 times: no road",
     ]
     assert "no space" not in caplog.text
 

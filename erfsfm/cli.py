@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from erfsfm.common import command_line
+from erfsfm.common.command_line import Device, Json, Overrides, Seed, UnusedSeed
 from erfsfm.common.errors import ConfigError, DataError, ErfsfmError
 from erfsfm.common.progress import progress_bar
 from erfsfm.common.table import Table, table_of
@@ -29,11 +30,6 @@ evaluate_app = typer.Typer(
 )
 app.add_typer(evaluate_app, name="evaluate")
 
-Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="where to compute")]
-Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of the random numbers")]
-UnusedSeed = Annotated[
-    int, typer.Option("--seed", hidden=True, help="accepted for old scripts; nothing is random")
-]
 Weights = Annotated[
     str, typer.Option(help="a shipped name (default, sim) or a training output folder")
 ]
@@ -43,7 +39,6 @@ ManyWeights = Annotated[
         help="a shipped name (default, sim) or a training output folder; repeat to compare"
     ),
 ]
-Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
 Fidelity = Annotated[
     Literal["default", "paper"], typer.Option(help="paper: exactly as the reference code")
 ]
@@ -78,9 +73,7 @@ def train(
     resume: Annotated[
         bool, typer.Option("--resume", help="resume from the last checkpoint in OUTPUT")
     ] = False,
-    overrides: Annotated[
-        list[str] | None, typer.Option("--set", help="section.key=value; repeat")
-    ] = None,
+    overrides: Overrides = None,
     seed: Annotated[int | None, typer.Option(help="overrides training.seed")] = None,
     device: Device = "auto",
 ) -> None:
@@ -339,14 +332,12 @@ def predict(
     import numpy as np
 
     from erfsfm.common.files import write_atomically
-    from erfsfm.common.readers.images import list_images, read_image, report_unreadable
+    from erfsfm.common.readers.images import images_at, read_image, report_unreadable
     from erfsfm.inference import DepthPosePredictor, colour_disparity
 
     if output.is_file():
         raise DataError(f"{output} is a file: give a folder as --output")
-    files = list_images(images) if images.is_dir() else [images]
-    if not files:
-        raise DataError(f"{images} holds no png or jpg to predict from")
+    files = images_at(images)
     if output.resolve() in {file.parent.resolve() for file in files}:
         raise DataError(
             f"{output} holds the images themselves: choose another --output, or they would be overwritten"
@@ -436,7 +427,7 @@ def receptive_field(
 
     from erfsfm.checkpoint import load_model
     from erfsfm.common.files import require_figure
-    from erfsfm.common.readers.images import list_images, resize_image
+    from erfsfm.common.readers.images import images_at, resize_image
     from erfsfm.inference import choose_device, read_image
     from erfsfm.networks.presets import PRESETS
     from erfsfm.receptive_field import draw_fields, field_table, measure_fields, street_snippet
@@ -445,7 +436,7 @@ def receptive_field(
     if images is None:
         snippet = street_snippet(5, height, width)
     else:
-        files = list_images(images)[:5] if images.is_dir() else []
+        files = images_at(images)[:5]
         if len(files) < 5:
             raise DataError(
                 f"--images needs a folder of five consecutive images; {images} has {len(files)}"

@@ -83,7 +83,7 @@ def choose_device(choice: str) -> Device:
 def _may_have_gpu() -> bool:
     """Whether PyTorch was built for one and a driver is there; otherwise it need not be imported to be asked."""
     has_driver = any(Path("/dev", name).exists() for name in _GPU_DRIVERS) or find_library("cuda")
-    return not version("torch").endswith("+cpu") and bool(has_driver or find_library("nvcuda"))
+    return not version("torch").endswith("+cpu") and bool(has_driver)
 
 
 @lru_cache(maxsize=1)
@@ -186,14 +186,13 @@ class DepthPosePredictor:
             the image larger than in its training (`ModelRecord.depth_input`).
         """
         require_image(image)
-        (height, width), size = image.shape[:2], self.record.depth_input
+        size = self.record.depth_input
         if size is None:
-            return depth_at(self.disparity(image), height, width)
-        return depth_at(
-            self.disparity(_input(image, size.height, size.width)) * np.float32(size.disparity),
-            height,
-            width,
-        )
+            disparity = self.disparity(image)
+        else:
+            larger = _input(image, size.height, size.width)
+            disparity = self.disparity(larger) * np.float32(size.disparity)
+        return depth_at(disparity, *image.shape[:2])
 
     def prepare(self, image: NDArray[np.uint8] | Array) -> Array:
         """An image ``(H, W, 3)`` uint8 RGB as the networks take it, for several calls on the same image.

@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from io import TextIOWrapper
-from typing import TextIO
+from typing import Annotated, Literal, TextIO
 
 import typer
 
@@ -20,6 +20,15 @@ from erfsfm.common.signals import Terminated
 # what they would say of a file is said in our own line
 _OPENCV = {"OPENCV_LOG_LEVEL": "SILENT", "OPENCV_FFMPEG_LOGLEVEL": "-8"}
 _INTERRUPTED = 130  # exit code that typer gives to ctrl-C
+
+
+Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="where the networks run")]
+Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of every random draw")]
+Overrides = Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")]
+Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
+# every verb that computes takes both; in one that draws nothing and runs no network they change nothing
+UnusedDevice = Annotated[Literal["auto", "cpu", "cuda"], typer.Option("--device", hidden=True)]
+UnusedSeed = Annotated[int, typer.Option("--seed", hidden=True)]
 
 
 class Terminal(logging.StreamHandler[TextIO]):

@@ -79,14 +79,10 @@ def find_config(file_or_name: str | Path, shipped: Sequence[Path]) -> Path:
         return known[str(file_or_name)]
     if path.is_dir():
         raise ConfigError(f"configuration '{file_or_name}' is a folder, not a YAML file")
-    nearest = difflib.get_close_matches(path.stem, known, 1)
-    hint = f"; did you mean '{nearest[0]}'?" if nearest else ""
     begun = [name for name in sorted(known) if name.startswith(path.stem)]  # "table1" begins many
     without_variants = [name for name in sorted(known) if "-" not in name]
-    names = ", ".join(begun or without_variants)
-    raise ConfigError(
-        f"no configuration file or name '{file_or_name}' (known names: {names or 'none'}){hint}"
-    )
+    names = ", ".join(begun or without_variants) or "none"
+    raise ConfigError(f"no configuration file or name '{file_or_name}' (known names: {names})")
 
 
 def read_model(model: type[M], path: Path, error: type[ErfsfmError], wrong: str) -> M:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-_NAMES = ("SIGTERM", "SIGHUP")  # Windows has no SIGHUP
+_ENDS = (signal.SIGTERM, signal.SIGHUP)
 
 
 class Terminated(SystemExit):
@@ -28,7 +28,7 @@ def calling_on_signals(stop: Callable[..., None]) -> Iterator[None]:
 
     Only in the main thread, and only for signals that are not ignored already.
     """
-    before = _handlers(("SIGINT", *_NAMES), lambda handler: handler is not signal.SIG_IGN)
+    before = _handlers((signal.SIGINT, *_ENDS), lambda handler: handler is not signal.SIG_IGN)
 
     def first(*_: object) -> None:
         _handle(
@@ -54,7 +54,7 @@ def raising_on_termination() -> Iterator[Callable[[], None]]:
         A function that ignores these signals for the rest of the block: ``timeout`` and shells send the same one
         several times, and the files written after the first one must become whole.
     """
-    before = _handlers(_NAMES, lambda handler: handler is signal.SIG_DFL)
+    before = _handlers(_ENDS, lambda handler: handler is signal.SIG_DFL)
 
     def ignore() -> None:
         _handle(dict.fromkeys(before, signal.SIG_IGN))
@@ -70,15 +70,11 @@ def raising_on_termination() -> Iterator[Callable[[], None]]:
         _handle(before)
 
 
-def _handlers(names: Sequence[str], is_replaced: Callable[[Any], bool]) -> dict[int, Any]:
+def _handlers(numbers: Sequence[int], is_replaced: Callable[[Any], bool]) -> dict[int, Any]:
     """Handlers that may be replaced, by signal; none outside the main thread."""
     if threading.current_thread() is not threading.main_thread():
         return {}
-    handlers = {
-        number: signal.getsignal(number)
-        for name in names
-        if (number := getattr(signal, name, None))
-    }
+    handlers = {number: signal.getsignal(number) for number in numbers}
     return {number: handler for number, handler in handlers.items() if is_replaced(handler)}
 
 

@@ -212,13 +212,8 @@ def _own(root: Path, given: Path | None) -> list[Recording]:
         )
     camera = Camera.of(written.pinhole)
     mask = None if written.mask is None else Path(written.mask)
-    images: list[Path] = []
-    if not is_video:  # those of a folder, or those of its one sub-folder of a usual name, or of the first that has any
-        usual = image_folder(home)
-        folders = [] if usual is None else [usual]
-        if file.parent == home and not folders:
-            folders = sorted(filter(Path.is_dir, home.iterdir()))
-        images = next((found for folder in folders if (found := list_images(folder))), [])
+    folder = None if is_video else image_folder(home)
+    images = [] if folder is None else list_images(folder)
     if not images:
         videos = map(Video, [root] if is_video else list_videos(home))
         return [

@@ -65,7 +65,6 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
             config.data.cache_mb - depth_mb - (0 if many_views is None else labels_mb(config.data))
         )
         self._cache = ArrayCache(images_mb, (*size, 3), np.uint8)
-        self._unreadable: set[str] = set()
         self._depth = ArrayCache(
             depth_mb, size, np.float32
         )  # true depth, inverse depth that is imitated
@@ -118,7 +117,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
             camera = recording.seen_by(self._config.network)
             (image,) = load_window(self._cache, Snippet(recording, index), 1)
             return single_image(image, camera, bounds, self._config, rng)
-        snippet, images = first_readable(self._chosen(rng), self._images, self._unreadable)
+        snippet, images = first_readable(self._chosen(rng), self._images)
         camera = snippet.recording.seen_by(self._config.network)
         seen = self._known(snippet)
         if self._config.single_images:

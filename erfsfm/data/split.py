@@ -17,7 +17,7 @@ from pathlib import Path
 
 from pydantic import Field
 
-from erfsfm.common.config_tree import Section, read_model
+from erfsfm.common.config_tree import Section, find_config, read_model
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import is_auto
 from erfsfm.common.readers.frame_range import EVERYTHING, KINDS, FrameRange
@@ -81,21 +81,12 @@ def read_split_file(name_or_path: str) -> Split:
     """Read a shipped split by its name, or a file.
 
     Raises:
-        DataError: neither a file nor a shipped name, or no split.
+        ConfigError: neither a file nor a shipped name.
+        DataError: no split.
     """
-    path = Path(name_or_path)
-    if not path.is_file():
-        wheel, source = config_folders()  # beside the named configurations
-        folders = wheel / "splits", source.parent / "splits"
-        shipped: dict[str, Path] = {}
-        for folder in folders:
-            for file in sorted(folder.glob("*.yaml")):
-                shipped[file.stem] = file
-        if name_or_path not in shipped:
-            raise DataError(
-                f"no split '{name_or_path}': neither a file nor one of {', '.join(shipped)}"
-            )
-        path = shipped[name_or_path]
+    wheel, source = config_folders()
+    folders = wheel / "splits", source.parent / "splits"  # beside the named configurations
+    path = find_config(name_or_path, folders)
     return read_model(Split, path, DataError, "is no split of train, validation and test")
 
 

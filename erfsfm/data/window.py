@@ -24,7 +24,6 @@ logger = logging.getLogger(__name__)
 
 HEIGHTS = 10.0  # camera heights in the networks' unit of depth: steps are then as small as initial outputs
 _MOST_IN_A_ROW = 20
-_MOST_NAMED = 10
 
 T = TypeVar("T")
 _BLOCK = 128  # arrays of the cache that are stored together
@@ -71,17 +70,8 @@ def load_window(cache: ArrayCache, snippet: Snippet, length: int) -> list[NDArra
     ]
 
 
-def first_readable(
-    snippets: Iterator[Snippet], read: Callable[[Snippet], T], named: set[str]
-) -> tuple[Snippet, T]:
-    """The first snippet that can be read, and what was read of it.
-
-    The reasons of those passed over are logged once each, the first ten of them, which ``named`` remembers.
-
-    Args:
-        snippets: to try, in order.
-        read: what is read of one.
-        named: reasons that were logged; new ones are added.
+def first_readable(snippets: Iterator[Snippet], read: Callable[[Snippet], T]) -> tuple[Snippet, T]:
+    """The first snippet that can be read, and what was read of it; a warning says why others are passed over.
 
     Raises:
         DataError: twenty in a row cannot be read.
@@ -91,10 +81,7 @@ def first_readable(
             return snippet, read(snippet)
         except DataError as error:
             reason = str(error)
-            if reason not in named and len(named) < _MOST_NAMED:
-                named.add(reason)
-                more = "; more files are not named" if len(named) == _MOST_NAMED else ""
-                logger.warning("%s: snippets with it are passed over%s", reason, more)
+            logger.warning("%s: snippets with it are passed over", reason)
     raise DataError(f"{_MOST_IN_A_ROW} snippets in a row cannot be read, the last: {reason}")
 
 

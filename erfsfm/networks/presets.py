@@ -1,6 +1,5 @@
 """Networks by name: the paper's, and depth networks with a pretrained encoder."""
 
-import difflib
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -61,9 +60,7 @@ def build(
         ConfigError: if the name or an option is unknown or out of range.
     """
     if name not in PRESETS:
-        close = difflib.get_close_matches(name, PRESETS, n=1, cutoff=0.4)
-        hint = f" (did you mean '{close[0]}'?)" if close else ""
-        raise ConfigError(f"unknown network '{name}'{hint}; known: {', '.join(PRESETS)}")
+        raise ConfigError(f"unknown network '{name}'; known: {', '.join(PRESETS)}")
     preset = PRESETS[name]
     if fidelity not in get_args(Fidelity):
         raise ConfigError(

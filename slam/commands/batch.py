@@ -220,9 +220,7 @@ def spread(
         there = {"address": scheduler, "timeout": "10s"}
         client = distributed.Client(**there if scheduler else local)
     except (OSError, ValueError) as error:
-        raise SlamError(
-            f"no Dask scheduler answers at {scheduler}: {one_line(str(error))}"
-        ) from error
+        raise SlamError(f"no Dask scheduler answers at {scheduler}: {error}") from error
     with client:
         futures = client.map(work, drives, pure=False)
         numbers = {future.key: number for number, future in enumerate(futures)}

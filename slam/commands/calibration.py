@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from erfsfm.common.errors import DataError
 from erfsfm.common.files import refuse_foreign, require_figure, save_figure
 from erfsfm.common.progress import Progress
 from erfsfm.common.readers.camera_file import CameraFile
-from erfsfm.common.readers.images import image_folder, list_images
+from erfsfm.common.readers.images import images_at, list_images
 from erfsfm.common.readers.numbering import in_order
 from erfsfm.common.readers.video import VideoFrames
 from slam.runtime.errors import SlamError, sequence_errors
@@ -125,17 +124,10 @@ def _write_picture(path: Path, fit: Calibration, camera: CameraFile, images: Ima
 
 def _open(recording: Path) -> tuple[ImageSource, float | None]:
     """The images, and their rate where they are a video."""
-    if not recording.exists():
-        raise DataError(f"no video or folder at {recording}: check the path")
     if recording.is_file():
         video = VideoFrames(recording)
         return video, video.fps
-    folder = image_folder(recording)
-    if folder is None:
-        raise DataError(
-            f"no images in {recording}: give a folder of png, jpg or bmp images, or a video"
-        )
-    return ImageFiles(in_order(list_images(folder))), None
+    return ImageFiles(in_order(images_at(recording))), None
 
 
 def _rounded(value: float) -> float:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from erfsfm.common import command_line
+from erfsfm.common.command_line import Device, Json, Overrides, Seed, UnusedDevice, UnusedSeed
 from erfsfm.common.progress import progress_bar
 from slam.runtime.errors import RunError, SlamError
 
@@ -35,15 +36,7 @@ Camera = Annotated[
 Frames = Annotated[str | None, typer.Option(help="A:B, half-open")]
 Weights = Annotated[str, typer.Option(help="default, sim, erf-dfc, erf-dfcv2 or a training output")]
 Config = Annotated[str | None, typer.Option(help="a YAML file or a shipped name")]
-Overrides = Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")]
 Output = Annotated[Path | None, typer.Option(help="the run folder; else results/<stamp>_<name>")]
-Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="where the networks run")]
-Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of every random draw")]
-Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
-
-# every verb that computes takes both; in one that draws nothing and runs no network they change nothing
-UnusedDevice = Annotated[Literal["auto", "cpu", "cuda"], typer.Option("--device", hidden=True)]
-UnusedSeed = Annotated[int, typer.Option("--seed", hidden=True)]
 
 
 @app.command()

@@ -165,8 +165,6 @@ def _export_occupancy(folder: RunFolder, output: Path, resolution: float) -> Pat
 def _map(folder: RunFolder, what: str, up: str) -> Ply:
     """The mesh or cloud of the map in the given axes."""
     ply = read_ply(folder.require(_MAPS[what]))
-    if len(ply.vertices) == 0 or (ply.triangles is not None and len(ply.triangles) == 0):
-        raise RunError("the map is empty: there is nothing to export")
     return ply if up == "y-down" else rotated(ply, R_UP_WORLDS[up])
 
 

@@ -14,7 +14,7 @@ from scipy.spatial.distance import cdist
 from erfsfm.common.errors import DataError
 from erfsfm.common.progress import Progress, silent
 from erfsfm.common.readers.camera_file import CAMERA_FILE, read_camera_file
-from erfsfm.common.readers.images import image_folder, list_images, read_image
+from erfsfm.common.readers.images import images_at, read_image
 from erfsfm.common.readers.numbering import in_order
 from erfsfm.common.table import DASH, Table
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
@@ -108,7 +108,7 @@ def localise(
             or none where the run undistorted its images.
     """
     require_stated(camera)
-    paths = _image_paths(images)
+    paths = images_at(images)
     first, last = frame_range(frames or ":", len(paths))
     places = Places.read(run.require(PLACES))
     if not places.views:
@@ -327,16 +327,3 @@ def _longer(
     J, residual = np.concatenate([by_pose, by_focal]).reshape(7, -1), (pixels - seen).T.ravel()
     covariance = np.linalg.inv(J @ J.T)
     return float(covariance[6] @ J @ residual), mad_sigma(residual) * float(covariance[6, 6]) ** 0.5
-
-
-def _image_paths(images: Path) -> list[Path]:
-    """One image, or the images of a folder in their order."""
-    if images.is_file():
-        return [images]
-    folder = image_folder(images) if images.is_dir() else None
-    if folder is None:
-        what = "no images in it" if images.is_dir() else "no such file or folder"
-        raise SequenceError(
-            f"{images}: {what}; give an image or a folder of png, jpg or bmp images"
-        )
-    return list_images(folder)

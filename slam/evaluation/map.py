@@ -65,6 +65,7 @@ _LEAF_POINTS = 32  # of the tree of true surface: less memory than with 16
 _NO_MAP = Failed("no map point lies within 25 m of a camera whose surroundings are known")
 _NO_SURFACE = Failed("no true surface is known at this distance from a camera")
 _FEW = Failed("too few points at this distance from a camera")
+# the values of every `PlacedMetrics`
 ERRORS = (
     "accuracy_median_m",
     "accuracy_90_m",
@@ -209,9 +210,6 @@ class PlacedMetrics(SurfaceMetrics):
     in_field: SurfaceMetrics = part(SurfaceMetrics)
     by_distance: list[SurfaceMetrics] | None = None
     scale: float | None = None
-
-
-"""The values of every `PlacedMetrics`."""
 
 
 def pose_similarity(

@@ -117,8 +117,7 @@ def _said(words: str, before: float, after: float, unit: str = "m") -> str:
 def _ate(estimate: FloatArray, reference: FloatArray) -> float:
     """Error of positions ``(N, 3)`` at 7 dof, in the reference's unit."""
     fit = se3.umeyama(reference, estimate, with_scale=True)
-    moved = fit.scale * estimate @ fit.R_a_b.T + fit.t_a_b
-    return float(np.sqrt(((moved - reference) ** 2).sum(axis=1).mean()))
+    return float(np.sqrt(((fit.apply(estimate) - reference) ** 2).sum(axis=1).mean()))
 
 
 def _clock(estimate: Trajectory, reference: Trajectory) -> tuple[float, float, float]:

@@ -154,11 +154,13 @@ class Similarity:
     R_a_b: FloatArray
     t_a_b: FloatArray
 
+    def apply(self, points_b: FloatArray) -> FloatArray:
+        """Points ``(N, 3)`` in b expressed in a."""
+        return self.scale * points_b @ self.R_a_b.T + self.t_a_b
+
     def apply_to_poses(self, T_b_k: FloatArray) -> FloatArray:
         """Poses ``(N, 4, 4)`` in b expressed in a: positions scaled, rotations turned."""
-        R_a_k = self.R_a_b @ T_b_k[:, :3, :3]
-        t_a_k = self.scale * T_b_k[:, :3, 3] @ self.R_a_b.T + self.t_a_b
-        return make(R_a_k, t_a_k)
+        return make(self.R_a_b @ T_b_k[:, :3, :3], self.apply(T_b_k[:, :3, 3]))
 
 
 def umeyama(points_a: FloatArray, points_b: FloatArray, with_scale: bool) -> Similarity:

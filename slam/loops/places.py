@@ -77,7 +77,7 @@ class Places:
         # Damaged bytes raise almost anything in zipfile, zlib, tokenize and NumPy: no list of types
         # is complete.
         except Exception as error:
-            reason = " ".join([f"{type(error).__name__}:", *str(error).split()])[:120]
+            reason = f"{type(error).__name__}: {error}"
             raise RunError(f"{path} is damaged ({reason}): run the sequence again") from error
         if version != _FORMAT:
             raise RunError(f"{path} has format {version}, this version reads {_FORMAT}: run again")

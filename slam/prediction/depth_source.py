@@ -19,7 +19,6 @@ import cv2
 import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
-from onnxruntime.capi import onnxruntime_pybind11_state as state
 
 from erfsfm.common.files import read_bytes
 from erfsfm.common.processes import open_session
@@ -390,9 +389,9 @@ class OnnxDepth:
         self.sha256 = hashlib.sha256(content).hexdigest()
         try:
             self._session = open_session(content, NETWORK_THREADS)
-        except _errors() as error:
+        except Exception as error:  # ONNX Runtime raises classes of its own
             raise SlamError(
-                f"{self._path} cannot be run by onnxruntime {onnxruntime.__version__}: {_short(error)}; copy or export "
+                f"{self._path} cannot be run by onnxruntime {onnxruntime.__version__}: {error}; copy or export "
                 "it again, as one file with all weights and no operators of others"
             ) from error
         notes = self._session.get_modelmeta().custom_metadata_map
@@ -420,9 +419,9 @@ class OnnxDepth:
         )
         try:
             (output,) = self._session.run([self._output], {self._input.name: tensor})
-        except _errors() as error:
+        except Exception as error:  # likewise
             raise SlamError(
-                f"{self._path} fails on an image of {self._width}x{self._height}: {_short(error)}"
+                f"{self._path} fails on an image of {self._width}x{self._height}: {error}"
             ) from error
         found = np.asarray(output)
         sides = [side for side in found.shape if side != 1]
@@ -494,18 +493,3 @@ class OnnxDepth:
                 f"{self._path} has {wanted}: set depth.output_name to one of {', '.join(names)}"
             )
         return names[0]
-
-
-def _errors() -> tuple[type[Exception], ...]:
-    """What ONNX Runtime raises: classes without a common base of their own."""
-    own = [
-        kind
-        for kind in vars(state).values()
-        if isinstance(kind, type) and issubclass(kind, Exception)
-    ]
-    return (*own, RuntimeError, ValueError)
-
-
-def _short(error: Exception) -> str:
-    text = " ".join(str(error).split())
-    return text if len(text) <= 200 else f"{text[:197]}..."

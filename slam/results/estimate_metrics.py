@@ -108,14 +108,14 @@ def timing_of(watch: Stopwatch, frames: int) -> records.Timing:
 
 def _sequence(result: Estimate, sequence: FrameSequence) -> records.SequenceMetrics:
     frames = len(sequence)
-    span = float(sequence.stamps[-1] - sequence.stamps[0]) if frames > 1 else 0.0
+    span = float(sequence.stamps[-1] - sequence.stamps[0])
     drive, reference = result.drive, result.reference
     scans = result.lidar.unreadable if isinstance(result.lidar, LidarPath) else {}
     return records.SequenceMetrics.of(
         name=sequence.name,
         frames=frames,
         length_m=_NO_TRUTH if reference is None else reference.length_m,
-        fps=(frames - 1) / span if span > 0 else Failed("all stamps are equal"),
+        fps=(frames - 1) / span,
         bridged_frames=len(drive.interpolated),
         bridged=_stretches(drive.interpolated),
         doubled=_stretches(dict.fromkeys(drive.doubled, DOUBLED)),
@@ -127,11 +127,9 @@ def _sequence(result: Estimate, sequence: FrameSequence) -> records.SequenceMetr
     )
 
 
-def _motion(result: Estimate) -> records.MotionMetrics | Failed:
+def _motion(result: Estimate) -> records.MotionMetrics:
     """How far and how fast the camera moved, and how often its steps were measured as standing."""
     path, seconds = path_distance(result.optimised.T_world_camera), result.optimised.stamps
-    if len(path) < 2:
-        return Failed("a single frame does not move")
     span = float(seconds[-1] - seconds[0])
     window = min(_TOP_SPEED_S, span)
     begins = seconds[seconds <= seconds[-1] - window]

@@ -15,8 +15,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from html import escape
+from logging.handlers import MemoryHandler
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from erfsfm.common.files import FolderLock, unfinished_name
 from slam.formats.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
@@ -304,34 +305,35 @@ def _link(link: Path, target: Path) -> None:
         logger.warning("could not link %s to %s: %s", link, target, error)
 
 
-class RunLog(logging.Handler):
-    """Buffers records until there is a file, then writes each at once.
+class _LogFile(logging.FileHandler):
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Lines that a full disk refuses are lost without a message."""
 
-    Of those that give one reason again and again the first is written, and at the end their number. On a full disk
-    lines are lost without a message.
+
+class RunLog(MemoryHandler):
+    """Holds records until there is a file, then writes each at once.
+
+    Of those that give one reason again and again the first is written, and at the end their number.
     """
 
     def __init__(self) -> None:
-        super().__init__()
-        self.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-        self._waiting: list[logging.LogRecord] = []
+        super().__init__(capacity=1)
         self._times: Counter[tuple[str, str]] = Counter()
-        self._file: TextIO | None = None
 
     def begin(self, path: Path) -> None:
-        """Write the buffered and all further records to a file."""
-        self._file = path.open("a", encoding="utf-8", errors="backslashreplace")
-        for record in self._waiting:
-            self._write(record)
+        """Write the records so far and all further ones to a file."""
+        file = _LogFile(path, encoding="utf-8", errors="backslashreplace")
+        file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        self.setTarget(file)
+        self.flush()
 
-    def emit(self, record: logging.LogRecord) -> None:
-        """Write or buffer a record."""
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether to write a record: it gives its reason for the first time, or none."""
         reason = record.args[-1] if isinstance(record.args, tuple) and record.args else None
-        if record.levelno == logging.INFO and isinstance(reason, str):
-            self._times[record.msg, reason] += 1
-            if self._times[record.msg, reason] > 1:
-                return
-        self._write(record)
+        if record.levelno != logging.INFO or not isinstance(reason, str):
+            return True
+        self._times[record.msg, reason] += 1
+        return self._times[record.msg, reason] == 1
 
     def failed(self, reason: str) -> None:
         """Write the reason of a failure to the file alone: the caller gets the exception."""
@@ -342,21 +344,14 @@ class RunLog(logging.Handler):
         for (_, reason), times in self._times.items():
             if times > 1:
                 self._say(logging.INFO, f"{times} times: {reason}")
-        if self._file is not None:
-            with suppress(OSError):  # flushes again what a full disk refused
-                self._file.close()
+        file = self.target
         super().close()
+        if file is not None:
+            with suppress(OSError):  # flushes again what a full disk refused
+                file.close()
 
     def _say(self, level: int, message: str) -> None:
-        self._write(logging.LogRecord("slam.commands.run", level, __file__, 0, message, None, None))
-
-    def _write(self, record: logging.LogRecord) -> None:
-        if self._file is None:
-            self._waiting.append(record)
-            return
-        with suppress(Exception):
-            self._file.write(f"{self.format(record)}\n")
-            self._file.flush()
+        self.handle(logging.LogRecord("slam.commands.run", level, __file__, 0, message, None, None))
 
 
 @contextmanager

@@ -180,7 +180,7 @@ def _placed(pieces: Iterator[FloatArray], fit: Similarity, cameras: cKDTree) -> 
     """The points of all pieces in the world of the truth that count at any of these cameras."""
     near = [np.empty((0, 3))]
     for points in pieces:
-        moved = fit.scale * points @ fit.R_a_b.T + fit.t_a_b
+        moved = fit.apply(points)
         near.append(
             moved[np.isfinite(cameras.query(moved, distance_upper_bound=RANGE_M + OUTLIER_M)[0])]
         )

@@ -115,13 +115,8 @@ class Record(BaseModel):
                 f"{path} cannot be read: {error.strerror}: check its permissions"
             ) from error
         except (OSError, ValueError, RecursionError) as error:
-            reason = (
-                first_problem(error)
-                if isinstance(error, ValidationError)
-                else getattr(error, "strerror", None)
-            )
-            text = " ".join(str(reason or error).split())
-            raise RunError(f"{path} is damaged: {text}; run the sequence again") from error
+            reason = first_problem(error) if isinstance(error, ValidationError) else error
+            raise RunError(f"{path} is damaged: {reason}; run the sequence again") from error
 
     def __getitem__(self, key: str) -> Any:
         """The value of a key as JSON has it, so that a record reads like the file."""

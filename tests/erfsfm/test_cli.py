@@ -91,7 +91,7 @@ def test_help_of_every_command_loads_no_heavy_library():
             ["train", "--config", "tiny", "--set", "training.stepz=1"],
             "did you mean 'training.steps'",
         ),
-        (["predict", "nowhere.png"], "no weights 'default'"),
+        (["predict", "{image}"], "no weights 'default'"),
         (["predict", "nowhere.png", "--weights", "{weights}"], "nowhere.png"),
         (
             ["train", "--config", "tiny", "--dataset", "{root}", "--output", "new", "--resume"],

@@ -95,6 +95,21 @@ def image_folder(folder: Path) -> Path | None:
     return found[0] if found else None
 
 
+def images_at(place: Path) -> list[Path]:
+    """An image file, or those of a folder or of its one sub-folder of a usual name, in natural order.
+
+    Raises:
+        DataError: there are none, or several sub-folders have images.
+    """
+    if place.is_file():
+        return [place]
+    folder = image_folder(place) if place.is_dir() else None
+    if folder is None:
+        what = "no images in it" if place.is_dir() else "no such file or folder"
+        raise DataError(f"{place}: {what}; give an image or a folder of png, jpg or bmp images")
+    return list_images(folder)
+
+
 def recording_folder(folder: Path) -> Path:
     """The folder that names a recording: this one, or its parent where it is only called ``images`` or the like."""
     folder = folder.absolute()

@@ -28,7 +28,6 @@ from slam.results.metrics import METRES, AcceptedLoop, LoopsFile, Metrics
 from slam.results.report import tables
 from slam.results.tables import alignments_table, errors_table, missing_errors
 from slam.results.verdict import verdict
-from slam.runtime.errors import SlamError
 from slam.runtime.files import LOOPS, REFERENCE, REPORT, TRAJECTORIES
 from slam.runtime.record import NOT_RECORDED
 
@@ -55,13 +54,12 @@ _LINES = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167), (213, 94
 
 @dataclass(frozen=True)
 class Picture:
-    """An image, a plot as Plotly's JSON, or the ``reason`` why it could not be drawn; ``image`` is its address."""
+    """An image by its address, or a plot as Plotly's JSON."""
 
     title: str
     caption: str
     image: str = ""
     plot: str = ""
-    reason: str = ""
 
 
 def write_report(
@@ -119,7 +117,7 @@ def _plots(
     loops: Sequence[AcceptedLoop],
     view: MapView | None,
 ) -> dict[str, list[Picture]]:
-    """The plots of every section; one that cannot be drawn (trajectories without common stamps) has the reason."""
+    """The plots of every section."""
     from slam.results.report import figures
 
     found: dict[str, list[Picture]] = {"trajectories": [], "errors": [], "map": []}
@@ -183,11 +181,8 @@ def _error_plots(metrics: Metrics, trajectories: Mapping[str, Trajectory]) -> li
 
 
 def _plot(title: str, caption: str, draw: Callable[..., Figure], *given: Any) -> Picture:
-    """What ``draw`` makes of what is given, or the reason why it cannot."""
-    try:
-        figure = draw(*given).update_layout(template={})  # page.js draws it in the page's colours
-    except SlamError as error:
-        return Picture(title, caption, reason=str(error))
+    """What ``draw`` makes of what is given."""
+    figure = draw(*given).update_layout(template={})  # page.js draws it in the page's colours
     return Picture(title, caption, plot=str(figure.to_json()).replace("<", "\\u003c"))
 
 

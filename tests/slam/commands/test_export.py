@@ -12,12 +12,11 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from meshes import coloured_ply
 
 from erfsfm.common.readers.camera_file import read_camera_file
 from slam.commands.cli import app
 from slam.commands.export import R_UP_WORLDS, export
-from slam.formats.ply import Ply, read_ply, write_ply
+from slam.formats.ply import Ply, read_ply
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Intrinsics
 from slam.geometry.se3 import FloatArray, apply, invert
@@ -146,17 +145,6 @@ def test_a_grid_of_too_many_cells_is_one_line(make_recorded: MakeRun, tmp_path: 
     with pytest.raises(RunError, match=r"--resolution 1e-05 gives .* cells"):
         export(make_recorded(), "occupancy", tmp_path / "new" / "map.yaml", resolution=1e-5)
     assert not (tmp_path / "new").exists()
-
-
-def test_an_empty_map_is_not_exported(make_recorded: MakeRun, tmp_path: Path):
-    folder = make_recorded()
-    nothing = np.zeros((0, 3))
-    write_ply(
-        folder.path / "map_mesh.ply",
-        coloured_ply(nothing, nothing, nothing, np.zeros((0, 3), np.int64)),
-    )
-    with pytest.raises(RunError, match="the map is empty"):
-        export(folder, "mesh", tmp_path / "m.ply")
 
 
 @pytest.fixture(scope="module")

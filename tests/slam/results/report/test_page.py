@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slam.formats.trajectory import Trajectory
 from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose
 from slam.loops.verification import Loop
 from slam.mapping.depth import KeyframeDepth
@@ -279,16 +278,6 @@ def test_a_failed_run_has_its_reason(make_run: MakeRun):
     assert "frame 7 <is> broken" in balance.words
     assert "No trajectory was written" in html
     assert "FAILED" in html
-
-
-def test_trajectories_without_common_stamps_leave_the_rest_of_the_report(make_run: MakeRun):
-    folder = make_run()
-    late = folder.trajectory("odometry")
-    folder.write_trajectory("lidar", Trajectory(late.stamps + 1e6, late.T_world_camera))
-    write_report(folder)
-    html, _ = parsed(folder)
-    assert "not drawn, no time stamps match" in html
-    assert plots(html) == {}
 
 
 def pixels(picture: Picture) -> NDArray[np.uint8]:

@@ -249,9 +249,8 @@ class TrainingConfig(Section):
         le=1,
         description="factor on the learning rate of a lite0 encoder, which is pretrained",
     )
-    schedule: Literal["constant", "cosine", "step"] = Field(
-        default="constant",
-        description="of the learning rate; step: divided by ten in the last quarter",
+    schedule: Literal["constant", "cosine"] = Field(
+        default="constant", description="of the learning rate"
     )
     average_decay: float = Field(
         default=0.0,

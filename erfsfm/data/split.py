@@ -19,6 +19,7 @@ from pydantic import Field
 
 from erfsfm.common.config_tree import Section, read_model
 from erfsfm.common.errors import DataError
+from erfsfm.common.readers.camera_file import is_auto
 from erfsfm.common.readers.frame_range import EVERYTHING, KINDS, FrameRange
 from erfsfm.config import EIGEN, DataConfig, config_folders
 from erfsfm.data.discovery import discover
@@ -135,7 +136,7 @@ def split_recordings(
     split = read_split_file(config.split) if config.split else Split()
     division = _Division(config, split)
     roots = config.roots
-    if camera and str(camera).startswith("auto"):
+    if camera is not None and is_auto(camera):
         roots, camera = [scene_of(root, camera, folder) for root in roots], None
     found = [each for root in roots for each in discover(root, camera)]
     if camera is not None and not any(each.name.startswith("folder/") for each in found):

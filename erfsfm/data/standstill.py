@@ -89,8 +89,9 @@ def _unchanged(recording: Recording) -> NDArray[np.bool_]:
             gradient = np.hypot(*slopes)
             low, high = np.quantile(gradient, [1.0 - _TEXTURED, _TEXTURED])
             change = np.abs(change - np.median(change))
-            noise, shift = np.median(change[gradient <= low]), np.median(change[gradient > high])
-            texture = max(float(np.median(gradient[gradient > high])), 1.0)
+            is_textured = gradient >= high  # everywhere in a blank image
+            noise, shift = np.median(change[gradient <= low]), np.median(change[is_textured])
+            texture = max(float(np.median(gradient[is_textured])), 1.0)
             changes[index] = np.sqrt(max(shift**2 - noise**2, 0.0)) / texture
         previous = small
     changes[0] = changes[min(1, len(changes) - 1)]

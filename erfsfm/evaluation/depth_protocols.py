@@ -34,7 +34,7 @@ from erfsfm.evaluation.depth_metrics import (
     standard_error,
 )
 from erfsfm.evaluation.streets import EVERY, Street, find_streets
-from erfsfm.inference import DepthPosePredictor, refuse_leak
+from erfsfm.inference import DepthPosePredictor, colour_disparity, refuse_leak
 
 logger = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ _PICTURE_WIDTH = 620
 CAP_HEIGHTS = 50.0  # camera heights: some 80 m from a car's roof
 LARGEST_RATIO = 1.3  # of the bounds of a pixel's depth; wider ones are no truth
 SLAM_WEIGHTS = "default"
-TRUTH_FOLDER = "truth"
+TRUTH_FOLDER = "truth_by_flow"
 # all frames
 _RUN = "--set loops.enabled=false --set mapping.keyframe_distance_m=0.3 --set output.report=false"
 _RATIOS = ("abs_rel", "rmse_log", "a1", "a2", "a3")  # errors without a unit: the scale is fitted
@@ -204,24 +204,13 @@ def _depth_rows(
 def _picture(
     image: NDArray[np.uint8], depths: Iterable[NDArray[np.float32]], truth: NDArray[np.float32]
 ) -> bytes:
-    """A JPEG, image, depths in metres and truth below each other, at most `_PICTURE_WIDTH` wide; near is bright."""
-    known = truth > 0
-    nearness = [1 / depth for depth in depths]
-    nearness.append(np.where(known, 1 / np.where(known, truth, 1), 0))
+    """A JPEG: image, depths in metres and truth below each other, at most `_PICTURE_WIDTH` wide; near is bright."""
     ratio = min(1, _PICTURE_WIDTH / image.shape[1])
-    height = round(image.shape[0] * ratio)
-    width = round(image.shape[1] * ratio)
-    points = 1 + 2 * round(
-        image.shape[1] / _PICTURE_WIDTH
-    )  # of LiDAR, which would vanish in a smaller picture
-    nearness[-1] = cv2.dilate(nearness[-1], np.ones((points, points)))
-    brightest = np.percentile(nearness[-1][nearness[-1] > 0], 98)
-    shown = [image[..., ::-1]]
-    for values in nearness:
-        shade = np.clip(values / brightest * 255, 0, 255).astype(np.uint8)
-        shown.append(np.asarray(cv2.applyColorMap(shade, cv2.COLORMAP_MAGMA), np.uint8))
-    rows = [cv2.resize(each, (width, height), interpolation=cv2.INTER_AREA) for each in shown]
-    return bytes(cv2.imencode(".jpg", np.vstack(rows))[1])
+    points = np.ones((1 + 2 * round(1 / ratio),) * 2)  # of LiDAR, which would vanish when shrunk
+    measured = cv2.erode(np.where(truth > 0, truth, np.inf), points).astype(np.float32)
+    shown = np.vstack([image, colour_disparity(np.vstack([*depths, measured]))])[..., ::-1]
+    shrunk = cv2.resize(shown, None, fx=ratio, fy=ratio, interpolation=cv2.INTER_AREA)
+    return bytes(cv2.imencode(".jpg", shrunk)[1])
 
 
 def _depth_row(

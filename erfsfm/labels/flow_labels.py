@@ -14,13 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.labels.road import impose_road, road_plane
 from erfsfm.mvs.views import Array, Grey
 
 NEIGHBOURS = (-4, -2, -1, 1, 2, 4)  # frames
 MIN_SNR = 5.0  # inverse depth over its sigma
 LEAST_SIGMA = 0.01  # of the inverse depth: no label is surer, for the poses are not
-LEAST_TRAVEL = 0.1  # camera heights between the first and the last neighbour
 
 SKY_BRIGHTNESS = 0.95  # of the brightest pixels of the upper half
 SKY_GRADIENT = 8.0  # grey levels a pixel, smoothed
@@ -43,8 +41,7 @@ def label(
 ) -> tuple[Array, Array]:
     """Least and most inverse depth of each pixel ``(H, W)``, in one over camera heights; 0 and infinite if unknown.
 
-    Pixels without two agreeing neighbours, and dynamic objects that appear to lie under the road, are unknown; the road
-    is filled in where its surroundings lie on one plane; the sky is bounded from above.
+    Pixels without two agreeing neighbours are unknown; the sky is bounded from above.
 
     Args:
         target: grey image ``(H, W)``.
@@ -53,28 +50,13 @@ def label(
         T_neighbour_target: ``(N, 4, 4)``, translations in camera heights.
     """
     inverse_depth, sigma = measure(target, neighbours, K, T_neighbour_target, fine=True)
-    at_least = np.zeros_like(inverse_depth)
-    reliable = inverse_depth > MIN_SNR * sigma
-    p = rays(target.shape[0], target.shape[1], K)
-    forward = direction_of_travel(T_neighbour_target)
-    plane = None if forward is None else road_plane(inverse_depth, reliable, p, forward)
-    if plane is not None:
-        road = (p @ plane).astype(np.float32)
-        at_least = impose_road(inverse_depth, sigma, reliable, road)
     sigma = np.maximum(sigma, LEAST_SIGMA * np.abs(inverse_depth))
-    least = np.maximum(np.where(np.isfinite(sigma), inverse_depth - sigma, 0), at_least)
-    most = np.where(np.isfinite(sigma), np.maximum(inverse_depth, 0) + sigma, np.inf)
+    known = np.isfinite(sigma)
+    least = np.where(known, np.maximum(inverse_depth - sigma, 0), 0)
+    most = np.where(known, np.maximum(inverse_depth, 0) + sigma, np.inf)
     sky = sky_mask(target, (float(K[0, 2]), float(K[1, 2])))
     least[sky], most[sky] = 0, SKY_INVERSE_DEPTH
     return least.astype(np.float32), most.astype(np.float32)
-
-
-def direction_of_travel(T_neighbour_target: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """From the neighbours before to those after, in the target's frame, ``(3,)``; None where the camera stood."""
-    places = np.linalg.inv(T_neighbour_target)[:, :3, 3]
-    travelled = places[-1] - places[0]
-    length = float(np.linalg.norm(travelled))
-    return travelled / length if length > LEAST_TRAVEL else None
 
 
 def sky_mask(grey: Grey, horizon: tuple[float, float]) -> NDArray[np.bool_]:

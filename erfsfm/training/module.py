@@ -272,7 +272,7 @@ def decisive(metrics: dict[str, float], networks: TrainedNetworks = "both") -> f
 
 def learning_rate_factor(schedule: str, progress: float, step: int = _WARM_UP) -> float:
     """Factor on the learning rate after a fraction of the run; a cosine ends at 2 % and begins with a warm-up."""
-    if schedule == "cosine":
-        risen = min(max((step + 1) / _WARM_UP, 20 * progress), 1)
-        return risen * (0.51 + 0.49 * math.cos(math.pi * progress))
-    return 0.1 if schedule == "step" and progress >= 0.75 else 1.0
+    if schedule == "constant":
+        return 1.0
+    risen = min(max((step + 1) / _WARM_UP, 20 * progress), 1)
+    return risen * (0.51 + 0.49 * math.cos(math.pi * progress))

@@ -19,7 +19,6 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 import erfsfm
 from erfsfm.checkpoint import Model, read_torch, save_model
-from erfsfm.common.config_tree import read_yaml
 from erfsfm.common.errors import ConfigError, TrainingError
 from erfsfm.common.progress import Progress, duration
 from erfsfm.common.readers.frame_range import merge
@@ -96,23 +95,13 @@ class OutputFolder:
             "pose_net",
         }:
             raise TrainingError(f"{self.checkpoint} {wrong}")
-        begun, wanted = (
-            read_yaml(self.config),
-            config.model_dump(mode="json"),
-        )  # begun with settings of another version
-        sections = (
-            [begun.get(name) for name in ("network", "training")]
-            if isinstance(begun, dict)
-            else [None]
-        )
-        if not all(isinstance(section, dict) for section in sections):
-            raise TrainingError(f"{self.config} is damaged: start again in another --output")
-        if begun["network"] != wanted["network"]:
+        begun = load_experiment(self.config)
+        if begun.network != config.network:
             raise ConfigError(
                 f"the networks of {self.config} differ from this configuration: resume with the same one"
             )
         for key in ("networks", "frozen_stages"):
-            before, now = begun["training"].get(key), wanted["training"][key]
+            before, now = getattr(begun.training, key), getattr(config.training, key)
             if before != now:
                 raise ConfigError(
                     f"{self.config} began with training.{key} {before}; got {now}: resume with the same"

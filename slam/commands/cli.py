@@ -143,7 +143,7 @@ def batch(
     weights: Annotated[str | None, typer.Option(help="as for run")] = None,
     config: Config = None,
     overrides: Overrides = None,
-    frames: Annotated[str | None, typer.Option(help="A:B of every drive")] = None,
+    frames: Frames = None,
     seed: Seed = 0,
     device: Device = "auto",
 ) -> None:
@@ -289,7 +289,7 @@ def localize(
         Path | None,
         typer.Option(help="camera.yaml or fov=70; default: beside the images, else the run's"),
     ] = None,
-    frames: Annotated[str | None, typer.Option(help="A:B of the images, half-open")] = None,
+    frames: Frames = None,
     every: Annotated[int, typer.Option(min=1, help="every n-th of them")] = 1,
     output: Annotated[
         Path | None,

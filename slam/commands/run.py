@@ -18,7 +18,7 @@ from erfsfm.common.errors import explained, without_secrets
 from erfsfm.common.files import FolderLock
 from erfsfm.common.processes import limit_library_threads
 from erfsfm.common.progress import Progress, progress_bar, progress_lines, silent
-from erfsfm.common.readers.camera_file import CameraFile
+from erfsfm.common.readers.camera_file import CameraFile, is_auto
 from erfsfm.common.signals import raising_on_termination
 from erfsfm.inference import DepthPosePredictor, commit
 from slam.config.sections import SlamConfig, dump_yaml, load_config
@@ -67,7 +67,7 @@ from slam.runtime.files import (
     source_from_anywhere,
 )
 from slam.runtime.imports import import_extra
-from slam.sequences.camera_file import AUTO, is_auto, write_camera
+from slam.sequences.camera_file import AUTO, write_camera
 from slam.sequences.gps_track import read_gps
 from slam.sequences.recording import RecordedSequence
 from slam.simulation.recording import open_or_embedded
@@ -100,11 +100,8 @@ class Request(Section):
         """The request of arguments given by name.
 
         Raises:
-            TypeError: an unknown argument.
-            RunError: a value of another kind.
+            RunError: an unknown argument, or a value of another kind.
         """
-        if unknown := arguments.keys() - cls.model_fields.keys():
-            raise TypeError(f"run_slam has no argument {', '.join(sorted(unknown))}")
         try:
             return cls(**arguments)
         except ValidationError as error:

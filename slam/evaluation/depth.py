@@ -46,7 +46,7 @@ class DepthErrors:
 
     def __init__(self) -> None:
         self._depths: list[NDArray[np.float32]] = []
-        self._frames, self._step = -1, 1
+        self._frames, self._step = 0, 1
 
     def add(
         self,
@@ -65,8 +65,9 @@ class DepthErrors:
         v, u = np.nonzero((truth >= LEAST_M) & (truth <= LARGEST_M))
         if len(v) == 0:
             return
+        is_passed_over = self._frames % self._step != 0
         self._frames += 1
-        if self._frames % self._step:
+        if is_passed_over:
             return
         thinned = np.linspace(0, len(v) - 1, min(len(v), _PIXELS_OF_A_FRAME)).astype(int)
         v, u = v[thinned], u[thinned]
@@ -77,7 +78,7 @@ class DepthErrors:
         estimate = np.minimum(depth[at], LARGEST_M)
         around = np.ones((2 * round(_NEAR * true_width) + 1,) * 2, np.uint8)
         least = cv2.erode(np.where(truth > 0, truth, np.inf), around)
-        is_broken = (cv2.dilate(truth, around) > _SMOOTH * least)[v, u]
+        is_broken = (cv2.dilate(truth, around) / _SMOOTH > least)[v, u]
         of_frame = np.stack([estimate, truth[v, u], sigma, is_broken])[:, known]
         self._depths.append(of_frame.astype(np.float32))
         if len(self._depths) > _MOST_FRAMES:

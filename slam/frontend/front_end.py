@@ -122,8 +122,9 @@ class MotionTracker:
         segment = self._alone.segments[-1]
         located: list[tuple[int, FloatArray]] = []
         for each in segment.frames[-_FRAMES:]:
-            if each.index <= index and each.T_camera_world is not None:
-                located.append((each.index, each.T_camera_world))
+            T_frame_map = segment.T_camera_world(each)
+            if each.index <= index and T_frame_map is not None:
+                located.append((each.index, T_frame_map))
         if len(located) < 2 or located[-1][0] != index:
             return None
         (before, T_before_map), (_, T_frame_map) = located[-2:]

@@ -30,7 +30,7 @@ from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.motion import Motion, RelativeRotation, Steps
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import Failed
-from slam.runtime.memory import SpilledArray, SpillFile
+from slam.runtime.memory import Spilled, SpillFile
 
 T = TypeVar("T")
 
@@ -53,8 +53,8 @@ class Keyframe:
     """A frame for fusion, thinned and spilled to disk."""
 
     index: int
-    spilled_image: SpilledArray
-    spilled_depth: SpilledArray
+    spilled_image: Spilled
+    spilled_depth: Spilled
 
     @classmethod
     def of(cls, frame: Frame, depth_unscaled: DepthMap, spill_file: SpillFile) -> Keyframe:
@@ -68,12 +68,12 @@ class Keyframe:
     @property
     def image(self) -> Image:
         """``(h, w, 3)``."""
-        return self.spilled_image.read()
+        return self.spilled_image()
 
     @property
     def depth_unscaled(self) -> DepthMap:
         """``(h, w)``."""
-        return self.spilled_depth.read()
+        return self.spilled_depth()
 
     def cloud_unscaled(self, intrinsics: Intrinsics, stride: int) -> FloatArray:
         """Points ``(M, 3)`` in its camera, of every ``stride``-th pixel; intrinsics of any size."""

@@ -22,7 +22,7 @@ from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.linalg import solveh_banded
+from scipy.linalg import cholesky_banded, solveh_banded
 
 from slam.config.sections import ScaleMode
 from slam.frames import Ends, RelativePose
@@ -473,51 +473,25 @@ def solve_lengths(evidence: StepEvidence, camera_height: float = 1.0) -> StepLen
 def marginals(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Marginals of every length from the upper band ``(3, 2 S)`` of an information matrix.
 
-    Each length is followed by the unit of its step. The matrix is block tridiagonal by step, so the
-    marginal information from all earlier and from all later steps is each a chain of 2x2 Schur
-    complements.
+    Each length is followed by the unit of its step. The inverse is known inside the band from its
+    last row back, by the Cholesky factor (Takahashi et al. 1973).
 
     Returns:
         Sigmas ``(S,)``, and correlations ``(S,)`` with the neighbours' lengths in [0, 1), the mean
         of both sides. Errors whose correlation falls by a factor r from step to step have a sum of
         ``(1 + r) / (1 - r)`` times the variance of independent ones.
     """
-    neighbour, within, main = (band.reshape(-1, 2) for band in information)
-    own = np.stack([main[:, 0], within[:, 1], within[:, 1], main[:, 1]], axis=1)
-    before, after = (
-        _from_before(own, neighbour[1:]),
-        _from_before(own[::-1], neighbour[:0:-1])[::-1],
-    )
-    sigmas = np.sqrt(np.linalg.inv((before + after - own).reshape(-1, 2, 2))[:, 0, 0])
-    coupling = np.zeros((len(own) - 1, 2, 2))  # of a step and the next
-    coupling[:, 0, 0], coupling[:, 1, 1] = neighbour[1:].T
-    earlier, later = before[:-1].reshape(-1, 2, 2), after[1:].reshape(-1, 2, 2)
-    pairs = np.block([[earlier, coupling], [coupling, later]])  # (S - 1, 4, 4)
-    coupled = np.clip(
-        np.linalg.inv(pairs)[:, 0, 2] / (sigmas[:-1] * sigmas[1:]), 0.0, _MOST_CORRELATED
-    )
-    ends = coupled[:1], coupled[-1:]
-    return np.asarray(sigmas), 0.5 * (
-        np.concatenate([ends[0], coupled]) + np.concatenate([coupled, ends[1]])
-    )
-
-
-def _from_before(own: FloatArray, coupling: FloatArray) -> FloatArray:
-    """Information ``(S, 4)`` on each step from its ``own`` ``(S, 4)``, matrices row by row, and from all steps before.
-
-    ``coupling`` ``(S - 1, 2)`` is the diagonal of each block between a step and the next.
-    """
-    chain = own[:1].tolist()
-    for (a, b, _, d), (of_length, of_unit) in zip(own[1:].tolist(), coupling.tolist(), strict=True):
-        a_before, b_before, _, d_before = chain[-1]
-        determinant = a_before * d_before - b_before**2
-        b += of_length * of_unit * b_before / determinant
-        chain.append(
-            [
-                a - of_length**2 * d_before / determinant,
-                b,
-                b,
-                d - of_unit**2 * a_before / determinant,
-            ]
-        )
-    return np.array(chain)
+    second, first, main = cholesky_banded(information)
+    factors = main**-2.0, np.append(first[1:], 0.0) / main, np.append(second[2:], [0.0, 0.0]) / main
+    # covariances of each unknown with itself and the next two, from the last one back
+    rows = [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    for own, by_next, by_second in np.transpose(factors)[::-1].tolist():
+        (of_second, _, _), (of_next, of_both, _) = rows[-2:]
+        with_next = -by_next * of_next - by_second * of_both
+        with_second = -by_next * of_both - by_second * of_second
+        rows.append([own - by_next * with_next - by_second * with_second, with_next, with_second])
+    variances, _, with_next_length = np.array(rows[:1:-2]).T
+    sigmas = np.sqrt(variances)
+    coupled = with_next_length[:-1] / (sigmas[:-1] * sigmas[1:])
+    padded = np.pad(np.clip(coupled, 0.0, _MOST_CORRELATED), 1, mode="edge")
+    return sigmas, 0.5 * (padded[1:] + padded[:-1])

@@ -10,18 +10,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from erfsfm.common.processes import side_by_side
 from slam.frames import Descriptors, View
 from slam.geometry.se3 import FloatArray
-from slam.loops.features import hamming
 
 _TRAINING_DESCRIPTORS = 15_000
 _ROUNDS = 3
-_BLOCK_DESCRIPTORS = 200  # fit the processor's cache
 _WORDS = 1000  # size of the binary vocabulary learned on the run
 
 
@@ -75,17 +73,15 @@ def train_vocabulary(descriptors: Descriptors, words: int) -> Descriptors:
     return centres
 
 
-def nearest_words(descriptors: Descriptors, words: Descriptors) -> NDArray[np.int64]:
+def nearest_words(descriptors: Descriptors, words: Descriptors) -> NDArray[np.integer[Any]]:
     """The word ``(M,)`` of each descriptor by Hamming distance."""
-    blocks = [
-        descriptors[k : k + _BLOCK_DESCRIPTORS]
-        for k in range(0, len(descriptors), _BLOCK_DESCRIPTORS)
-    ]
-    nearest = side_by_side(lambda block: hamming(block, words).argmin(axis=1), blocks)
-    return np.concatenate([np.zeros(0, np.int64), *nearest])
+    if not len(descriptors):
+        return np.zeros(0, np.intp)
+    _, nearest = cv2.batchDistance(descriptors, words, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=1)
+    return nearest[:, 0]
 
 
-def _word_counts(views: Sequence[View], word: NDArray[np.int64]) -> csr_array:
+def _word_counts(views: Sequence[View], word: NDArray[np.integer[Any]]) -> csr_array:
     """Counts ``(V, words)`` of each word in each view; ``word`` is of all descriptors, view after view."""
     row = np.repeat(np.arange(len(views)), [len(view) for view in views])
     counts = csr_array((np.ones(len(word)), (row, word)), shape=(len(views), _WORDS))

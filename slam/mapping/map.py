@@ -80,12 +80,6 @@ class TsdfMap:
             self._surface = MapSurface(self._finished, self._config, progress)
         return self._surface
 
-    def mesh(self) -> Ply:
-        """The whole surface as triangles, in memory, a vertex that closes a hole ``filled``; raises as ``surface``."""
-        surface = self.surface()
-        vertices = np.concatenate(list(surface.vertex_pieces()))
-        return Ply(vertices, np.concatenate(list(surface.triangle_pieces())))
-
     def cloud(self) -> Ply:
         """The whole surface as points, in memory; raises as ``surface``."""
         return Ply(np.concatenate(list(self.surface().cloud_pieces())))

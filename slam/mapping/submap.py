@@ -19,13 +19,13 @@ from scipy.spatial import cKDTree
 
 from slam.frames import DepthMap, Image, Intrinsics
 from slam.geometry.robust import difference_equations, median
-from slam.geometry.se3 import BoolArray, FloatArray, apply, invert, length_of, rotation_angle
+from slam.geometry.se3 import FloatArray, apply, invert, length_of, rotation_angle
 from slam.mapping.depth import DepthFilters, KeyframeDepth, sampled
 from slam.runtime.imports import import_open3d
-from slam.runtime.memory import SpilledArray
+from slam.runtime.memory import Spilled
 
 Keys = NDArray[np.int64]
-SpilledSubmap = dict[str, SpilledArray]  # the fields of a `Submap` on disk
+SpilledSubmap = dict[str, Spilled]  # the fields of a `Submap` on disk
 
 BLOCK_SIDE = 16
 BLOCK_VOXELS = BLOCK_SIDE**3
@@ -54,15 +54,14 @@ _EXPOSURE_PRIOR = 0.01  # of equal exposures, over the information in the bright
 class Submap:
     """Voxels that were observed, and views.
 
-    ``keys`` ``(B, 3)`` int32 are coordinates of blocks of 16 voxels a side, ``observed`` ``(B, 512)`` the bits of their
-    voxels in the order z, y, x; ``tsdf`` ``(S,)`` float16 in truncation distances and ``weight`` ``(S,)`` uint16 belong
-    to the observed ones. Of each view: ``T_world_camera`` ``(K, 4, 4)``, image ``(K, h, w, 3)``, fused depth
-    ``(K, h, w)`` float16, 0 where nothing was fused, and ``brightness_steps`` ``(K, 3)`` by `_brightness_step`.
+    ``keys`` ``(B, 3)`` int32 are coordinates of blocks of 16 voxels a side. Of their voxels in the order z, y, x:
+    ``tsdf`` ``(B, 4096)`` float16 in truncation distances, and ``weight`` ``(B, 4096)`` uint16, 0 where nothing was
+    observed. Of each view: ``T_world_camera`` ``(K, 4, 4)``, image ``(K, h, w, 3)``, fused depth ``(K, h, w)`` float16,
+    0 where nothing was fused, and ``brightness_steps`` ``(K, 3)`` by `_brightness_step`.
     ``camera`` is fx, fy, cx, cy.
     """
 
     keys: NDArray[np.int32]
-    observed: NDArray[np.uint8]
     tsdf: NDArray[np.float16]
     weight: NDArray[np.uint16]
     T_world_camera: FloatArray
@@ -70,15 +69,6 @@ class Submap:
     depths: NDArray[np.float16]
     brightness_steps: FloatArray
     camera: FloatArray
-
-    def blocks(self, chosen: BoolArray) -> tuple[BoolArray, NDArray[np.intp]]:
-        """Observed voxels ``(C, 4096)`` of the chosen ``(B,)`` blocks, and their places in ``tsdf``, in order."""
-        counts = np.bitwise_count(self.observed).sum(axis=1, dtype=np.int64)
-        begins = np.cumsum(counts) - counts
-        begin, count = begins[chosen], counts[chosen]
-        shift = np.repeat(begin - (np.cumsum(count) - count), count)
-        places = np.arange(count.sum()) + shift
-        return np.unpackbits(self.observed[chosen], axis=1).astype(bool), places
 
 
 def new_grid(voxel_size_m: float, capacity: int = _CAPACITY) -> Any:
@@ -126,24 +116,18 @@ class Fusion:
         return True
 
     def observed(self) -> dict[str, NDArray[Any]]:
-        """Keys, bits of observed voxels, their distances and weights, as fields of a `Submap`, in order of the keys."""
+        """Keys, distances and weights, as fields of a `Submap`, in order of the keys."""
         places = self._grid.hashmap().active_buf_indices().numpy().astype(np.int64)
         keys = self._grid.hashmap().key_tensor().numpy()[places]
         order = np.lexsort(keys.T)  # that of Open3D's threads is not reproducible
-        weight = self._grid.attribute("weight").numpy().reshape(-1, BLOCK_VOXELS)[places[order]]
-        seen = weight > 0
-        tsdf = (
-            self._grid.attribute("tsdf")
-            .numpy()
-            .reshape(-1, BLOCK_VOXELS)[places[order]][seen]
-            .astype(np.float16)
+        tsdf, weight = (
+            self._grid.attribute(name).numpy().reshape(-1, BLOCK_VOXELS)[places[order]]
+            for name in ("tsdf", "weight")
         )
-        weights = np.minimum(weight[seen], _MOST_WEIGHT).astype(np.uint16)
         return {
             "keys": keys[order],
-            "observed": np.packbits(seen, axis=1),
-            "tsdf": tsdf,
-            "weight": weights,
+            "tsdf": tsdf.astype(np.float16),
+            "weight": np.minimum(weight, _MOST_WEIGHT).astype(np.uint16),
         }
 
 
@@ -152,9 +136,9 @@ class MergedSubmaps:
 
     def __init__(self, submaps: Sequence[SpilledSubmap]) -> None:
         """Read what stays in memory of at least one submap."""
-        self._keys: list[Keys] = [submap["keys"].read().astype(np.int64) for submap in submaps]
-        poses = [submap["T_world_camera"].read() for submap in submaps]
-        steps = [submap["brightness_steps"].read() for submap in submaps]
+        self._keys: list[Keys] = [submap["keys"]().astype(np.int64) for submap in submaps]
+        poses = [submap["T_world_camera"]() for submap in submaps]
+        steps = [submap["brightness_steps"]() for submap in submaps]
         self.T_world_views: FloatArray = np.concatenate(poses)
         self.brightness_steps: FloatArray = np.concatenate(steps)
         self.submap_of_view = np.repeat(np.arange(len(submaps)), [len(each) for each in steps])
@@ -163,7 +147,7 @@ class MergedSubmaps:
 
         @lru_cache(maxsize=_REMEMBERED)
         def read(number: int) -> Submap:
-            return Submap(**{name: array.read() for name, array in submaps[number].items()})
+            return Submap(**{name: array() for name, array in submaps[number].items()})
 
         self.read = read
 
@@ -197,12 +181,9 @@ class MergedSubmaps:
             submap = self.read(number)
             # where each block of the submap is among all of them: the numbers of their cells are sorted as their keys
             rows = np.searchsorted(cells_of_all, cells(self._keys[number][mask]))
-            observed, places = submap.blocks(mask)
-            own = np.zeros(observed.shape, np.float32)
-            own[observed] = submap.weight[places]
+            own = submap.weight[mask].astype(np.float32)
             weight[rows] += own
-            own[observed] *= submap.tsdf[places]
-            total[rows] += own
+            total[rows] += own * submap.tsdf[mask]
         np.divide(total, weight, out=total, where=weight > 0)
         return keys, total, weight
 

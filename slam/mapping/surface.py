@@ -35,7 +35,7 @@ from slam.mapping.submap import (
 )
 from slam.runtime.errors import EmptyMapError
 from slam.runtime.imports import import_open3d
-from slam.runtime.memory import SpilledArray, SpillFile
+from slam.runtime.memory import Spilled, SpillFile
 
 _LEAST_WEIGHT = 1.0  # observations of a voxel that becomes surface
 _LEAST_TRIANGLES = 300  # of a connected piece; smaller ones float
@@ -57,9 +57,9 @@ class Piece:
     each part.
     """
 
-    vertices: SpilledArray
-    triangles: SpilledArray
-    label: SpilledArray
+    vertices: Spilled
+    triangles: Spilled
+    label: Spilled
     shared: IntArray
     sizes: IntArray
 
@@ -114,8 +114,8 @@ class MapSurface:
     def vertex_pieces(self) -> Iterator[NDArray[np.void]]:
         """Vertices as records with position, normal, colour and ``filled``, each once, tile by tile."""
         for piece, (rows, begin) in zip(self._pieces, self._rows):
-            numbers, first = np.unique(rows.read(), return_index=True)
-            yield piece.vertices.read()[first[numbers >= begin]]
+            numbers, first = np.unique(rows(), return_index=True)
+            yield piece.vertices()[first[numbers >= begin]]
 
     def cloud_pieces(self) -> Iterator[NDArray[np.void]]:
         """The observed vertices, without the ones that close holes, as records."""
@@ -125,15 +125,15 @@ class MapSurface:
     def triangle_pieces(self) -> Iterator[Triangles]:
         """Triangles ``(t, 3)`` of all vertices, tile by tile."""
         for piece, (rows, _) in zip(self._pieces, self._rows):
-            numbered = rows.read()[piece.triangles.read()]
+            numbered = rows()[piece.triangles()]
             yield numbered[numbered[:, 0] >= 0]
 
     def meshes(self) -> Iterator[tuple[FloatArray, Triangles]]:
         """Vertices ``(V, 3)`` and triangles ``(T, 3)`` of each tile by itself."""
         for piece, (rows, _) in zip(self._pieces, self._rows):
-            triangles = piece.triangles.read()
-            kept = rows.read()[triangles[:, 0]] >= 0
-            yield Ply(piece.vertices.read()).points, triangles[kept].astype(np.int64)
+            triangles = piece.triangles()
+            kept = rows()[triangles[:, 0]] >= 0
+            yield Ply(piece.vertices()).points, triangles[kept].astype(np.int64)
 
     def write_mesh(self, path: Path) -> None:
         """Write the mesh as binary PLY, atomically; ``RunError`` where that fails."""
@@ -186,7 +186,7 @@ def _piece(patch: TileSurface, painter: Painter, spill: SpillFile) -> Piece:
 
 def _numbered(
     pieces: list[Piece], least_triangles: int, spill: SpillFile
-) -> tuple[list[tuple[SpilledArray, int]], int]:
+) -> tuple[list[tuple[Spilled, int]], int]:
     """Number the vertices of parts of so many triangles in all tiles together; of a shared one, in its first piece.
 
     Returns:
@@ -194,9 +194,9 @@ def _numbered(
         that is its own: those before are an earlier piece's. And how many triangles are kept.
     """
     begin = np.cumsum([0, *(len(piece.sizes) for piece in pieces)])
-    points = np.concatenate([Ply(piece.vertices.read()).points[piece.shared] for piece in pieces])
+    points = np.concatenate([Ply(piece.vertices()).points[piece.shared] for piece in pieces])
     part = np.concatenate(
-        [first + piece.label.read()[piece.shared] for first, piece in zip(begin, pieces)]
+        [first + piece.label()[piece.shared] for first, piece in zip(begin, pieces)]
     )
     _, earliest, group = np.unique(points, axis=0, return_index=True, return_inverse=True)
     group = group.ravel()
@@ -212,7 +212,7 @@ def _numbered(
     row_of_group = np.full(len(earliest), -1)
     rows, place, written, triangles = [], 0, 0, 0
     for first, last, piece in zip(begin, begin[1:], pieces):
-        own = kept_part[first + piece.label.read()]
+        own = kept_part[first + piece.label()]
         numbers = np.full(len(own), -1)
         groups = group[place : place + len(piece.shared)]
         is_first = earliest[groups] == np.arange(place, place + len(groups))

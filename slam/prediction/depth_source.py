@@ -17,11 +17,8 @@ from typing import Any, Literal, Protocol
 
 import cv2
 import numpy as np
-import onnx
 import onnxruntime
-from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
-from onnx.external_data_helper import convert_model_from_external_data
 from onnxruntime.capi import onnxruntime_pybind11_state as state
 
 from erfsfm.common.files import read_bytes
@@ -391,7 +388,14 @@ class OnnxDepth:
                 f"cannot read {self._path} ({error.strerror}): check depth.source=onnx:FILE"
             ) from error
         self.sha256 = hashlib.sha256(content).hexdigest()
-        self._session, notes = self._opened(content)
+        try:
+            self._session = open_session(content, NETWORK_THREADS)
+        except _errors() as error:
+            raise SlamError(
+                f"{self._path} cannot be run by onnxruntime {onnxruntime.__version__}: {_short(error)}; copy or export "
+                "it again, as one file with all weights and no operators of others"
+            ) from error
+        notes = self._session.get_modelmeta().custom_metadata_map
         self._input, self._shape, self._height, self._width = self._image_input(config)
         own = notes.get("input") == _OWN_INPUT and notes.get("kind") == "depth"
         self._kind, self._mean, self._std = self._settings(config, own)
@@ -428,31 +432,6 @@ class OnnxDepth:
                 f"{MOST_PIXELS:,} pixels; got {found.dtype} {found.shape}: choose another with depth.output_name"
             )
         return np.asarray(found.reshape(sides), dtype=np.float32)
-
-    def _opened(self, content: bytes) -> tuple[onnxruntime.InferenceSession, dict[str, str]]:
-        """A graph whose weights are all in its file, ready to run, and its metadata."""
-        try:
-            model = onnx.load_model_from_string(content)
-            if not model.graph.node:
-                raise DecodeError("no operators in it")
-        except DecodeError as error:
-            raise SlamError(
-                f"{self._path} is damaged or no ONNX file ({error}): copy or export it again"
-            ) from error
-        try:
-            # marks weights in other files as read, or finds that they are not
-            convert_model_from_external_data(model)
-        except ValueError as error:
-            reason = "keeps weights in other files, which are not read: save it as one file"
-            raise SlamError(f"{self._path} {reason}") from error
-        try:
-            session = open_session(model.SerializeToString(), NETWORK_THREADS)
-        except _errors() as error:
-            raise SlamError(
-                f"{self._path} cannot be run by onnxruntime {onnxruntime.__version__}, with its own operators alone: "
-                f"{_short(error)}"
-            ) from error
-        return session, {entry.key: entry.value for entry in model.metadata_props}
 
     def _settings(
         self, config: DepthConfig, own: bool

@@ -9,7 +9,8 @@ import ctypes
 import resource
 import sys
 import tempfile
-from dataclasses import dataclass
+from collections.abc import Callable
+from functools import partial
 from threading import Lock
 from typing import Any
 
@@ -17,6 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.runtime.errors import SlamError
+
+Spilled = Callable[[], NDArray[Any]]
+"""Reads an array that was spilled to a file."""
 
 
 def peak_rss_mb() -> float:
@@ -41,8 +45,8 @@ class SpillFile:
         self._end = 0
         self._lock = Lock()  # the file has one position, which every write and read moves
 
-    def put(self, array: NDArray[Any]) -> SpilledArray:
-        """Write an array.
+    def put(self, array: NDArray[Any]) -> Spilled:
+        """Write an array, and give what reads it back.
 
         Raises:
             SlamError: the disk is full.
@@ -60,15 +64,10 @@ class SpillFile:
                 f"{self._what} cannot be kept in {tempfile.gettempdir()} ({error.strerror or error}): "
                 "make room, set TMPDIR or switch fusion off (mapping.enabled=false)"
             ) from error
-        return SpilledArray(self, start, content.shape, content.dtype)
+        return partial(self._read, start, content.shape, content.dtype)
 
-    def read(self, start: int, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-        """An array that was put at ``start``.
-
-        Args:
-            start: the first byte.
-            shape: of the array.
-            dtype: of its values.
+    def _read(self, start: int, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+        """The array of this ``shape`` and type that begins at the byte ``start``.
 
         Raises:
             SlamError: the disk cannot be read.
@@ -82,17 +81,3 @@ class SpillFile:
             raise SlamError(
                 f"{self._what} in {tempfile.gettempdir()} cannot be read ({error}): run again"
             ) from error
-
-
-@dataclass(frozen=True)
-class SpilledArray:
-    """An array in a spill file: its place, shape and type."""
-
-    spill_file: SpillFile
-    start: int
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-
-    def read(self) -> NDArray[Any]:
-        """The array, as it was put."""
-        return self.spill_file.read(self.start, self.shape, self.dtype)

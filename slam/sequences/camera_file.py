@@ -25,10 +25,13 @@ from erfsfm.common.errors import DataError, ErfsfmError
 from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import (
     CAMERA_FILE,
+    CAMERA_WORD,
     UNKNOWN_FOV_DEG,
     UNKNOWN_FX_SIGMA,
     CameraFile,
     camera_of,
+    is_auto,
+    is_line,
     read_camera_file,
 )
 from erfsfm.common.readers.images import read_image
@@ -42,7 +45,6 @@ logger = logging.getLogger(__name__)
 
 DEFAULT_FPS = 10.0
 AUTO = Path("auto")
-_WORD = re.compile(r"auto|(fov|height|fps)=(\d+\.?\d*)")
 _STATED_FX_SIGMA = 0.1  # relative, by a field of view that the user states
 _ORB_COEFFICIENT = re.compile(r"Camera1?\.[kp]\d")
 _FOV_LIMITS_DEG = (3.0, 150.0)
@@ -134,9 +136,9 @@ def explicit_camera(given: Path, images: Sized, fps: float | None = None) -> Cam
         SequenceError: there is no such file, or the field of view is impossible.
         DataError: the file is malformed, or its lens is unknown.
     """
-    if not _is_line(given):
+    if not is_line(given):
         return read_explicit(given, fps)
-    matches = [_WORD.fullmatch(word) for word in str(given).split(",")]
+    matches = [CAMERA_WORD.fullmatch(word) for word in str(given).split(",")]
     values = {match[1]: float(match[2]) for match in matches if match and match[1]}
     fov_deg, fps = values.get("fov", UNKNOWN_FOV_DEG), values.get("fps", fps or DEFAULT_FPS)
     least, most = _FOV_LIMITS_DEG
@@ -179,11 +181,6 @@ def beside(*folders: Path, own: Mapping[str, Any] | None = None) -> CameraFile |
     return None if path is None else read_camera_file(path, own)
 
 
-def is_auto(given: Path) -> bool:
-    """Whether the user wants the camera to be found by its own images."""
-    return _is_line(given) and "fov=" not in str(given)
-
-
 def require_stated(given: Path | None) -> None:
     """Refuse a camera that has to be found first.
 
@@ -194,11 +191,6 @@ def require_stated(given: Path | None) -> None:
         raise SequenceError(
             f"--camera {given} finds the camera of a whole recording: give fov=70 here, or the {CAMERA_FILE} of a run"
         )
-
-
-def _is_line(given: Path) -> bool:
-    """Whether the user wrote a camera on one line, not the name of a file."""
-    return _WORD.fullmatch(str(given).split(",")[0]) is not None
 
 
 def _read_foreign(path: Path, fps: float) -> CameraFile | None:

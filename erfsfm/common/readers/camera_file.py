@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from erfsfm.common.config_tree import first_problem, read_yaml
 from erfsfm.common.errors import DataError, ErfsfmError
 
 CAMERA_FILE = "camera.yaml"
+CAMERA_WORD = re.compile(r"auto|(fov|height|fps)=(\d+\.?\d*)")  # of a camera on one line
 logger = logging.getLogger(__name__)
 
 HIGHEST_M = 100.0  # a camera that sees a road; heights in centimetres are beyond
@@ -114,6 +116,16 @@ class CameraFile(BaseModel):
         if self.camera_height_m is None:
             return default
         return None if isinstance(self.camera_height_m, str) else self.camera_height_m
+
+
+def is_line(given: Path) -> bool:
+    """Whether the user wrote a camera on one line, not the name of a file."""
+    return CAMERA_WORD.fullmatch(str(given).split(",")[0]) is not None
+
+
+def is_auto(given: Path) -> bool:
+    """Whether the user wants the camera to be found by its own images."""
+    return is_line(given) and "fov=" not in str(given)
 
 
 def read_camera_file(path: Path, own: Mapping[str, Any] | None = None) -> CameraFile:

@@ -8,6 +8,7 @@ know a depth as well.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -21,7 +22,7 @@ from slam.frontend.keyframes.image_turn import turned
 from slam.frontend.tracking import KEYFRAME_SEARCH, Pixels, are_inside, track
 from slam.geometry.multiview import PIXEL_SIGMA
 from slam.geometry.robust import median, weighted_median
-from slam.geometry.se3 import FloatArray, apply, invert
+from slam.geometry.se3 import FloatArray, apply, compose, invert
 
 TrackIds = NDArray[np.int64]
 
@@ -167,6 +168,17 @@ class LocalMap:
         return invert(
             np.array([keyframe.T_camera_world for keyframe in self.keyframes]).reshape(-1, 4, 4)
         )
+
+    def row_before(self, index: int) -> int:
+        """The row of the last keyframe up to a frame."""
+        return bisect_right(self.keyframes, index, key=lambda keyframe: keyframe.index) - 1
+
+    def T_camera_world(self, frame: TrackedFrame) -> FloatArray | None:
+        """The pose of a frame, wherever adjustments moved its keyframe; None where it was lost."""
+        if frame.T_camera_keyframe is None:
+            return None
+        keyframe = self.keyframes[self.row_before(frame.index)]
+        return compose(frame.T_camera_keyframe, keyframe.T_camera_world)
 
     def known(self, track_ids: TrackIds) -> NDArray[np.bool_]:
         """Which tracks have a point ``(M,)``."""
@@ -371,12 +383,15 @@ class LocalMap:
 
 @dataclass(frozen=True)
 class TrackedFrame:
-    """Corners of a frame, ``track_ids`` ``(M,)`` and ``pixels`` ``(M, 2)``; its pose, None where it was lost."""
+    """Corners of a frame, ``track_ids`` ``(M,)`` and ``pixels`` ``(M, 2)``; its pose, None where it was lost.
+
+    The pose is relative to the last keyframe up to it, for adjustments move both alike.
+    """
 
     index: int
     track_ids: TrackIds
     pixels: Pixels
-    T_camera_world: FloatArray | None
+    T_camera_keyframe: FloatArray | None
 
 
 class NewImage:

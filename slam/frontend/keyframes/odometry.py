@@ -157,8 +157,7 @@ class KeyframeOdometry:
         segment = self.segments[-1]
         self._T_camera_world, self._T_last_step, self._lost = T_camera_world, np.eye(4), 0
         self._add_keyframe(segment, frame, track_ids, pixels)
-        pixels = in_middle_row(pixels, self._turn_rate, self._intrinsics)
-        segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, self._T_camera_world))
+        self._keep(frame, track_ids, in_middle_row(pixels, self._turn_rate, self._intrinsics))
 
     def _follow(self, frame: Frame) -> None:
         before, self._small = self._small, small_image(frame.grey)
@@ -194,7 +193,7 @@ class KeyframeOdometry:
         if turn.correlation > _SURE_CORRELATION and not self._lost:
             self._T_camera_world = T_turned
             self._add_keyframe(segment, frame, *_NOTHING)
-            segment.frames.append(TrackedFrame(frame.index, *_NOTHING, self._T_camera_world))
+            self._keep(frame, *_NOTHING)
             return
         self._lost += 1
         segment.frames.append(TrackedFrame(frame.index, *_NOTHING, None))
@@ -218,7 +217,7 @@ class KeyframeOdometry:
     def locates(self, first: int, last: int) -> bool:
         """Whether two of the last frames both have a pose in the newest map."""
         frames = self.segments[-1].frames[-_LAST_FRAMES:] if self.segments else []
-        located = {frame.index for frame in frames if frame.T_camera_world is not None}
+        located = {frame.index for frame in frames if frame.T_camera_keyframe is not None}
         return {first, last} <= located
 
     def _begin(self, frame: Frame) -> None:
@@ -296,8 +295,14 @@ class KeyframeOdometry:
                 if is_doubtful or settled.sum() < MIN_POINTS:
                     self._check_first_motion(segment, track_ids, first, seen)
             self._add_keyframe(segment, frame, track_ids, places, is_turn)
-        segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, self._T_camera_world))
+        self._keep(frame, track_ids, pixels)
         return True
+
+    def _keep(self, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
+        """Keep a frame at the present pose, relative to the newest keyframe."""
+        segment = self.segments[-1]
+        T = compose(self._T_camera_world, invert(segment.keyframes[-1].T_camera_world))
+        segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, T))
 
     def _parallax(self, segment: LocalMap) -> Parallax:
         if self._known_parallax is None:

@@ -144,11 +144,12 @@ def _segment_poses(segment: LocalMap, intrinsics: Intrinsics, seed: int) -> list
             T_guess = T_of[frame.index]
             continue
         pixels = frame.pixels.astype(np.float64)
-        guess = T_guess if frame.T_camera_world is None else frame.T_camera_world
+        followed = segment.T_camera_world(frame)
+        guess = T_guess if followed is None else followed
         located = _seen_from(segment, frame.track_ids, pixels, guess, intrinsics, seed)
         if located is not None:
             T_guess, sigmas = located
-            nearest = [keyframe for keyframe in keyframes if keyframe.index < frame.index][-1]
+            nearest = keyframes[segment.row_before(frame.index)]
             poses.append(_relative(nearest, frame.index, T_guess, sigmas))
     return poses
 

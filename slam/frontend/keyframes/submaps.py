@@ -29,7 +29,7 @@ from slam.frontend.keyframes.local_map import (
 from slam.frontend.keyframes.units import learned_units
 from slam.geometry.multiview import MIN_POINTS
 from slam.geometry.robust import median
-from slam.geometry.se3 import FloatArray, apply, chain, invert, length_of
+from slam.geometry.se3 import FloatArray, apply, chain, compose, invert, length_of, make
 
 logger = logging.getLogger(__name__)
 
@@ -124,20 +124,21 @@ def _add_turns(
         if part_of[k] < 0 or part_of[k] != part_of[k - 1]:
             earlier, later = keyframes[k - 1], keyframes[k]
             by_image = None if tied[k - 1] else pace
-            turn = _turn(earlier, later.index, later.T_camera_world, by_image)
+            T = compose(earlier.T_camera_world, invert(later.T_camera_world))
+            turn = _turn(earlier, later.index, T, by_image)
             parts[before[k - 1]].turns.append(turn)
 
 
 def _add_frames(parts: Sequence[LocalMap], part_of: NDArray[np.intp], segment: LocalMap) -> None:
     """Frames of a map to its parts; those that were located outside are turns of the part before."""
-    starts = np.array([keyframe.index for keyframe in segment.keyframes])
     before = _part_before(part_of)
     for frame in segment.frames:
-        k = int(np.searchsorted(starts, frame.index, side="right")) - 1
+        k = segment.row_before(frame.index)
+        keyframe = segment.keyframes[k]
         if part_of[k] >= 0:
             parts[part_of[k]].frames.append(frame)
-        elif frame.T_camera_world is not None and frame.index != starts[k]:
-            turn = _turn(segment.keyframes[k], frame.index, frame.T_camera_world)
+        elif frame.T_camera_keyframe is not None and frame.index != keyframe.index:
+            turn = _turn(keyframe, frame.index, invert(frame.T_camera_keyframe))
             parts[before[k]].turns.append(turn)
 
 
@@ -169,14 +170,14 @@ def _held(segment: LocalMap, carried: FloatArray) -> LocalMap:
 
 
 def _turn(
-    keyframe: TrackedKeyframe, index: int, T_camera_world: FloatArray, pace: float | None = None
+    keyframe: TrackedKeyframe, index: int, T_keyframe_camera: FloatArray, pace: float | None = None
 ) -> RelativePose:
     """From a keyframe to a later camera in the unit of learned depth.
 
     Where no points lead there, but the whole image, it is a turn of unknown small length, whatever
     later adjustments made of it: at most some way at the camera's ``pace`` by frame.
     """
-    T = keyframe.T_camera_world @ invert(T_camera_world)
+    T = T_keyframe_camera.copy()
     learned = keyframe.learned_depth[np.isfinite(keyframe.learned_depth)]
     depth = median(learned) if len(learned) else 1.0
     if pace is None:
@@ -267,16 +268,12 @@ def moved(segment: LocalMap, T_world_camera: FloatArray, scales: FloatArray) -> 
     keyframes = [
         replace(k, T_camera_world=T) for k, T in zip(segment.keyframes, T_camera_world, strict=True)
     ]
-    indices = np.array([keyframe.index for keyframe in keyframes])
     frames = []
     for frame in segment.frames:
-        row = max(int(np.searchsorted(indices, frame.index, side="right")) - 1, 0)
-        T_followed = None
-        if frame.T_camera_world is not None:
-            T_frame_keyframe = frame.T_camera_world @ invert(segment.keyframes[row].T_camera_world)
-            T_frame_keyframe[:3, 3] *= scales[row]
-            T_followed = T_frame_keyframe @ T_camera_world[row]
-        frames.append(replace(frame, T_camera_world=T_followed))
+        T = frame.T_camera_keyframe
+        if T is not None:
+            T = make(T[:3, :3], scales[segment.row_before(frame.index)] * T[:3, 3])
+        frames.append(replace(frame, T_camera_keyframe=T))
     return LocalMap(keyframes, points, frames, segment.started, segment.turns)
 
 

@@ -90,6 +90,13 @@ def test_by_images_at_night(tmp_path, write_raw):
     assert spans(open_drive(drive)[0]) == [(0, 4), (7, 10)]
 
 
+def test_blank_images_stand_still(tmp_path, write_raw, recwarn):
+    drive = write_raw(tmp_path, speeds=None, frames=3, size=(64, 208))
+    for path in (drive / "image_02/data").iterdir():
+        cv2.imwrite(str(path), np.zeros((64, 208, 3), np.uint8))
+    assert spans(open_drive(drive)[0]) == [] and not recwarn.list
+
+
 @pytest.mark.data
 def test_real_recordings_never_stand_still(data_root):
     """A drive at 38 km/h and more: by speed and by images."""

@@ -66,7 +66,7 @@ def test_keyframes_that_are_uncertain_everywhere_are_left_out_and_hide_no_neighb
     statistics = tsdf_map.statistics()
     assert (statistics["frames_fused"], statistics["frames_left_out"]) == (5, 4)
     assert statistics["filters"]["agreement"] < 0.2
-    assert np.quantile(distance_to_street(tsdf_map.mesh().points), 0.99) < 0.1
+    assert np.quantile(distance_to_street(tsdf_map.cloud().points), 0.99) < 0.1
     nothing = driven(range(0))
     assert nothing.statistics()["frames_left_out"] == 9
     with pytest.raises(SlamError, match=r"none of 9 keyframes .* at most 0.3"):
@@ -78,11 +78,11 @@ def test_one_wall_lands_where_the_camera_saw_it():
     tsdf_map = TsdfMap(MappingConfig(), CAMERA)
     for z in (0.0, 0.5, 1.0):
         tsdf_map.integrate(KeyframeDepth(0, plate(8.0 - z), None, GREY, pose(1.0, 0.5, z)))
-    vertices = tsdf_map.mesh().points
+    vertices = tsdf_map.cloud().points
     np.testing.assert_allclose(vertices[:, 2], 8.0, atol=0.003)
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     np.testing.assert_allclose(centre, [1.0, 0.5, 8.0], atol=0.11)
-    np.testing.assert_allclose(tsdf_map.mesh().colours, 128, atol=3)
+    np.testing.assert_allclose(tsdf_map.cloud().colours, 128, atol=3)
 
 
 def test_depth_inconsistent_between_views_is_left_out():
@@ -93,7 +93,7 @@ def test_depth_inconsistent_between_views_is_left_out():
         return depth
 
     tsdf_map = street_map(ghost)
-    assert distance_to_street(tsdf_map.mesh().points).max() < 0.2
+    assert distance_to_street(tsdf_map.cloud().points).max() < 0.2
     assert (
         tsdf_map.statistics()["filters"]["agreement"]
         > street_map().statistics()["filters"]["agreement"] + 0.001
@@ -117,7 +117,7 @@ def test_flying_pixels_and_far_depth_are_left_out(monkeypatch):
         tsdf_map = TsdfMap(MappingConfig(), CAMERA)
         for x in (0.0, 0.31):
             tsdf_map.integrate(KeyframeDepth(0, smeared, None, GREY, pose(x, 0.0, 0.0)))
-        return tsdf_map.mesh().points
+        return tsdf_map.cloud().points
 
     def between(vertices):
         return ((vertices[:, 2] > 7.5) & (vertices[:, 2] < 12.5)).sum()
@@ -141,10 +141,12 @@ def test_files_are_written_whole_and_read_back(tmp_path):
     assert statistics["frames_fused"] == 12
     assert mesh.has_vertex_colors() and mesh.has_vertex_normals()
     assert cloud.has_normals()
-    whole = tsdf_map.mesh()
-    np.testing.assert_array_equal(np.asarray(mesh.vertices), whole.points)
-    np.testing.assert_array_equal(np.asarray(mesh.triangles), whole.triangles)
-    np.testing.assert_array_equal(read_ply(tmp_path / "mesh.ply").vertices, whole.vertices)
+    vertices, triangles = (
+        np.concatenate(list(pieces))
+        for pieces in (tsdf_map.surface().vertex_pieces(), tsdf_map.surface().triangle_pieces())
+    )
+    np.testing.assert_array_equal(np.asarray(mesh.triangles), triangles)
+    np.testing.assert_array_equal(read_ply(tmp_path / "mesh.ply").vertices, vertices)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cloud.ply", "mesh.ply"]
 
 
@@ -156,8 +158,8 @@ def test_a_map_goes_on_after_its_surface_was_asked_for():
             tsdf_map.integrate(KeyframeDepth(k, street(position[:3, 3]), None, GREY, position))
         counts = asked.statistics()
         assert counts["frames_fused"] == k + 1 and sum(counts["filters"].values()) > 0
-        assert counts["triangles"] == len(asked.mesh().triangles)
-    assert asked.mesh().points[:, 2].max() > whole.mesh().points[:, 2].max() - 0.5
+        assert counts["triangles"] == asked.surface().triangles > 0
+    assert asked.cloud().points[:, 2].max() > whole.cloud().points[:, 2].max() - 0.5
 
 
 def test_a_car_that_comes_towards_the_camera_is_not_fused(monkeypatch):
@@ -171,7 +173,7 @@ def test_a_car_that_comes_towards_the_camera_is_not_fused(monkeypatch):
         return np.where(on_plate, np.minimum(depth, distance), depth)
 
     def ghosts(tsdf_map: TsdfMap) -> int:
-        x, y, z = tsdf_map.mesh().points.T
+        x, y, z = tsdf_map.cloud().points.T
         return int(((np.abs(x + 4.0) < 0.9) & (y < 1.2) & (z < 24.0)).sum())
 
     monkeypatch.setattr("slam.mapping.depth._MAX_DEPTH_DIFFERENCE", 0.3)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from slam.config.sections import MappingConfig
+from slam.formats.ply import Ply
 from slam.frames import Intrinsics
 from slam.mapping import surface
 from slam.mapping.depth import KeyframeDepth
@@ -44,8 +45,9 @@ def test_tiles_are_joined_without_a_seam(street_map, monkeypatch):
     # a wall without noise that was seen once lies on voxels exactly, whose vertices coincide
     monkeypatch.setattr(surface, "_LEAST_TRIANGLES", 0)
     monkeypatch.setattr(surface, "_LEAST_WEIGHT", 2.0)
-    mesh = street_map(voxel_size_m=0.1).mesh()
-    vertices, triangles = mesh.points, mesh.triangles
+    whole = street_map(voxel_size_m=0.1).surface()
+    vertices = Ply(np.concatenate(list(whole.vertex_pieces()))).points
+    triangles = np.concatenate(list(whole.triangle_pieces()))
     assert len(np.unique(vertices, axis=0)) == len(vertices)
     edges = Counter(
         map(tuple, np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).tolist())
@@ -84,21 +86,22 @@ def test_a_view_without_depth_paints_nothing_right_before_it(monkeypatch):
         T_world_camera = np.eye(4)
         T_world_camera[2, 3] = z
         tsdf_map.integrate(KeyframeDepth(frame, depth, None, image, T_world_camera))
-    mesh = tsdf_map.mesh()
-    plate = mesh.colours[(np.abs(mesh.points[:, :2]) < 0.15).all(axis=1)]
+    cloud = tsdf_map.cloud()
+    plate = cloud.colours[(np.abs(cloud.points[:, :2]) < 0.15).all(axis=1)]
     assert len(plate) and plate[:, 1].max() < 25
 
 
 def test_a_hole_of_the_road_is_closed_and_marked(street_map, monkeypatch):
     monkeypatch.setattr(surface, "_LEAST_WEIGHT", 2.0)
     whole = street_map(hidden=True, close_holes_m=4.0)
-    mesh = whole.mesh()
-    filled = mesh.vertices["filled"] > 0
+    vertices = np.concatenate(list(whole.surface().vertex_pieces()))
+    filled = vertices["filled"] > 0
     assert filled.sum() == 1
-    np.testing.assert_allclose(mesh.points[filled][0], [0, 1.65, 20], atol=0.7)
-    assert mesh.vertices["ny"][filled][0] < -0.99
-    assert len(whole.cloud().points) == len(mesh.points) - 1
-    assert not street_map(hidden=True, close_holes_m=1.5).mesh().vertices["filled"].any()
+    np.testing.assert_allclose(Ply(vertices[filled]).points[0], [0, 1.65, 20], atol=0.7)
+    assert vertices["ny"][filled][0] < -0.99
+    assert len(whole.cloud().points) == len(vertices) - 1
+    smaller = street_map(hidden=True, close_holes_m=1.5).surface()
+    assert smaller.points == smaller.vertices
 
 
 @pytest.mark.parametrize(

@@ -20,11 +20,11 @@ def test_arrays_come_back_in_any_order():
     ]
     spill_file = SpillFile()
     kept = [spill_file.put(array) for array in arrays]
-    kept[0].read()
+    kept[0]()
     kept.append(spill_file.put(arrays[0]))
     for array, each in reversed(list(zip([*arrays, arrays[0]], kept, strict=True))):
-        np.testing.assert_array_equal(each.read(), array)
-        assert each.read().dtype == array.dtype
+        np.testing.assert_array_equal(each(), array)
+        assert each().dtype == array.dtype
 
 
 def test_threads_read_while_others_write():
@@ -32,7 +32,7 @@ def test_threads_read_while_others_write():
 
     def write_and_read(number: int) -> bool:
         kept = [spill_file.put(np.full(2000, 1000 * number + k)) for k in range(50)]
-        return all((each.read() == 1000 * number + k).all() for k, each in enumerate(kept))
+        return all((each() == 1000 * number + k).all() for k, each in enumerate(kept))
 
     with ThreadPoolExecutor(4) as threads:
         assert all(threads.map(write_and_read, range(40)))
@@ -43,4 +43,4 @@ def test_a_file_that_was_cut_short_is_an_error_and_no_garbage():
     kept = spill_file.put(np.ones((100, 100)))
     spill_file._file.truncate(5000)
     with pytest.raises(SlamError, match=r"cannot be read .*: run again"):
-        kept.read()
+        kept()

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
 from slam.frames import Intrinsics
-from slam.frontend.keyframes.local_map import LocalMap, NewImage, TrackedKeyframe
+from slam.frontend.keyframes.local_map import LocalMap, NewImage, TrackedFrame, TrackedKeyframe
 from slam.geometry.se3 import FloatArray, apply, invert, make
 
 CAMERA = Intrinsics(640, 480, 500.0, 500.0, 319.5, 239.5)
@@ -112,6 +114,17 @@ def test_adjustment_takes_the_unit_of_loose_points_from_themselves():
     local.adjust(CAMERA)
     np.testing.assert_allclose(local.points, points, rtol=1e-3)
     np.testing.assert_allclose(local.keyframes[-1].T_camera_world, invert(along(0.6)), atol=1e-4)
+
+
+def test_frames_go_along_with_their_keyframe_when_it_is_adjusted():
+    points = scene()
+    local = LocalMap(points=points.copy())
+    for k in range(4):
+        local.add(seen(2 * k, along(0.2 * k), points, 1.0))
+    local.keyframes[3] = replace(local.keyframes[3], T_camera_world=invert(along(0.65)))
+    frame = TrackedFrame(7, np.arange(0), np.zeros((0, 2), np.float32), invert(along(0.1)))
+    local.adjust(CAMERA)
+    np.testing.assert_allclose(local.T_camera_world(frame), invert(along(0.7)), atol=1e-3)
 
 
 def test_a_step_of_a_sixth_of_the_image_is_followed_by_dense_flow():

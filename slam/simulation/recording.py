@@ -12,11 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.common.readers.camera_file import CameraFile
 from slam.formats.ply import write_ply
 from slam.formats.trajectory import Trajectory, write_kitti
 from slam.runtime.errors import SequenceError
-from slam.sequences.camera_file import write_camera
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.images import ReadImages
 from slam.sequences.recording import RecordedSequence, Source, frame_range, uniform_stamps
@@ -173,13 +171,14 @@ def _write_records(world: SimulatedWorld, root: Path) -> None:
     (root / "poses").mkdir()
     stamps = np.arange(len(world), dtype=np.float64)
     write_kitti(root / "poses" / "sim.txt", Trajectory(stamps, world.T_world_camera))
-    file = CameraFile(
-        **{key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
-        fps=options.rate,
-        camera_height_m=world.camera_height_m,
-        readout_ms=1e3 * options.readout_s,
-    )
-    write_camera(root, file, fixed=None)
+    keys = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
+    keys["fps"] = options.rate
+    if world.camera_height_m is not None:
+        keys["camera_height_m"] = world.camera_height_m
+    if options.readout_s:
+        keys["readout_ms"] = 1e3 * options.readout_s
+    keys["model"] = "pinhole"
+    write_lines(root / "camera.yaml", [f"{key}: {value}" for key, value in keys.items()])
     record = {**asdict(options), "version": VERSION}
     write_lines(root / "simulation.json", [json.dumps(record, indent=2)])
 

@@ -278,10 +278,10 @@ def unit_pose_by_essential(
         seed: of the draws.
     """
     order = ransac_order(len(rays_previous), seed)
-    rays_previous, rays_current = rays_previous[order], rays_current[order]
+    previous, current = rays_previous[order, :2], rays_current[order, :2]
     E, mask = cv2.findEssentialMat(
-        rays_previous[:, :2].copy(),
-        rays_current[:, :2].copy(),
+        previous,
+        current,
         np.eye(3),
         method=cv2.USAC_MAGSAC,
         prob=0.999,
@@ -290,20 +290,11 @@ def unit_pose_by_essential(
     )
     if E is None or E.shape != (3, 3) or int(mask.sum()) < _LEAST_CONSENSUS:
         return None
-    inliers = mask.ravel().astype(bool)
-    rays_previous, rays_current = rays_previous[inliers], rays_current[inliers]
-    R, R_twisted, direction = cv2.decomposeEssentialMat(E)
-    unit_poses = [
-        UnitRelativePose(rotated, sign * direction.ravel())
-        for rotated in (R, R_twisted)
-        for sign in (1.0, -1.0)
-    ]
-
-    def in_front_of_both(unit_pose: UnitRelativePose) -> int:
-        depth = triangulated_depth(rays_previous, rays_current, unit_pose)
-        return int(((depth > 0) & (depth_in_current(rays_previous, depth, unit_pose) > 0)).sum())
-
-    return max(unit_poses, key=in_front_of_both)
+    # of four motions that explain it, the one by which most points are in front of both cameras
+    _, R_current_previous, direction, _, _ = cv2.recoverPose(
+        E, previous, current, np.eye(3), distanceThresh=np.inf, mask=mask
+    )
+    return UnitRelativePose(R_current_previous, direction.ravel())
 
 
 def unit_poses_by_homography(

@@ -180,13 +180,10 @@ def new_corners(
 
 def _away_from(pixels: Pixels, radius: int, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     """A mask ``(H, W)``, zero within ``radius`` of pixels ``(M, 2)`` inside of it."""
-    height, width = shape[0] + 2 * radius, shape[1] + 2 * radius
-    disc = np.zeros((2 * radius + 1,) * 2, np.uint8)
-    rows, columns = np.nonzero(cv2.circle(disc, (radius, radius), radius, 1, -1))
-    u, v = np.rint(pixels).astype(np.int64).T
-    mask = np.full(height * width, 255, np.uint8)
-    mask[np.add.outer(v * width + u, rows * width + columns)] = 0
-    return mask.reshape(height, width)[radius : height - radius, radius : width - radius]
+    mask = np.full(shape, 255, np.uint8)
+    for centre in np.rint(pixels).astype(np.int64).tolist():
+        cv2.circle(mask, centre, radius, 0, thickness=-1)
+    return mask
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from slam.frontend.visual.motion import (
     shortest_by_start,
     triangulated,
 )
-from slam.geometry.se3 import FloatArray, invert
+from slam.geometry.se3 import FloatArray, invert, normalised
 
 # sigmas of single steps are widened by this: the errors of neighbouring steps are correlated
 _STEP_WIDENING = 3.0
@@ -71,7 +71,7 @@ def smooth_rotations(steps: Steps, relative_rotations: Mapping[Ends, RelativeRot
     directions = T_current_previous[:, :3, 3]
     lengths = np.linalg.norm(directions, axis=1, keepdims=True)
     turned = directions + lengths * moves[:, :, 0]
-    T_current_previous[:, :3, 3] = turned * lengths / np.linalg.norm(turned, axis=1, keepdims=True)
+    T_current_previous[:, :3, 3] = lengths * normalised(turned)
     smoothed = dict(steps)
     for motion, T in zip(motions.values(), invert(T_current_previous), strict=True):
         pose = replace(motion.relative_pose, T_from_to=T)

@@ -25,6 +25,7 @@ from slam.geometry.se3 import (
     length_of,
     make,
     nearest_rotation,
+    normalised,
     rotation_matrix,
 )
 
@@ -66,11 +67,7 @@ class Resection:
 
 
 def ransac_order(count: int, seed: int) -> NDArray[np.intp]:
-    """The order ``(count,)`` of the points for a RANSAC method of OpenCV's; 0 is the given one.
-
-    Some methods have a fixed seed, others that of OpenCV, which is set too.
-    """
-    cv2.setRNGSeed(seed)
+    """The order ``(count,)`` of the points for a RANSAC of OpenCV, whose own seed is fixed; 0 is the given one."""
     order = np.arange(count, dtype=np.intp)
     return order if seed == 0 else np.random.default_rng(seed).permutation(order)
 
@@ -384,8 +381,7 @@ def rotation_between(rays_previous: FloatArray, rays_current: FloatArray) -> Flo
 
     Orthogonal Procrustes on unit rays, trimmed to the better three quarters, so that dynamic objects do not bias it.
     """
-    unit_previous = rays_previous / np.linalg.norm(rays_previous, axis=1, keepdims=True)
-    unit_current = rays_current / np.linalg.norm(rays_current, axis=1, keepdims=True)
+    unit_previous, unit_current = normalised(rays_previous), normalised(rays_current)
     kept = np.ones(len(unit_previous), dtype=bool)
     most = 3 * len(unit_previous) // 4
     for _ in range(_TRIMMINGS):

@@ -45,6 +45,11 @@ def length_of(vector: ArrayLike) -> float:
     return float(np.linalg.norm(vector))
 
 
+def normalised(vectors: FloatArray) -> FloatArray:
+    """The vectors ``(N, D)`` at unit length."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
 def rotation_angle(R: FloatArray) -> FloatArray:
     """Angle in radians of a rotation ``(3, 3)`` or of many ``(N, 3, 3)``, in [0, pi], accurate at both ends."""
     return np.asarray(Rotation.from_matrix(R).magnitude())

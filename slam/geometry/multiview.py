@@ -360,7 +360,7 @@ def parallax_px(
     rays_previous: FloatArray,
     rays_current: FloatArray,
     R_current_previous: FloatArray,
-    focal: tuple[float, float],
+    focal: tuple[float, float] | float,
 ) -> FloatArray:
     """Optical flow of each point in pixels ``(M,)`` without that of the rotation.
 
@@ -368,10 +368,10 @@ def parallax_px(
         rays_previous: ``(M, 3)`` with z = 1, in the previous camera.
         rays_current: of the same points ``(M, 3)`` with z = 1, in the current one.
         R_current_previous: the rotation ``(3, 3)`` between them.
-        focal: both focal lengths, pixels.
+        focal: both focal lengths, or one for both, pixels.
     """
     rotated = rays_previous @ R_current_previous.T
-    rotated = rotated[:, :2] / np.where(rotated[:, 2:] > 1e-6, rotated[:, 2:], 1e-6)
+    rotated = rotated[:, :2] / np.maximum(rotated[:, 2:], 1e-6)
     difference = (rays_current[:, :2] - rotated) * focal
     return np.linalg.norm(difference, axis=1)
 

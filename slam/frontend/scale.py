@@ -224,12 +224,10 @@ def find_scale(unit: Unit, drive: Drive, lidar_steps: Sequence[RelativePose] = (
     rows = zip(steps, np.transpose(values).tolist(), strict=True)
     lengths = {ends: StepLength(*row) for ends, row in rows if np.isfinite(row[0])}
     log_speed = running_median(np.log(solved.length / evidence.seconds), _SPEED_STEPS)
-    at = np.flatnonzero(solved.contradicted)
-    # the middles of the windows that end before such a step and begin with it
-    middles = np.add.outer([-_SPEED_STEPS // 2, _SPEED_STEPS // 2], at)
-    around = log_speed[np.clip(middles, 0, len(steps) - 1)]
-    (leaps,) = np.nan_to_num(np.diff(around, axis=0)).tolist()
-    contradicted = {steps[row]: leap for row, leap in zip(at.tolist(), leaps, strict=True)}
+    # from the window that ends before each step to that which begins with it
+    padded = np.pad(log_speed, (_SPEED_STEPS // 2 + 1, _SPEED_STEPS // 2), mode="edge")
+    leaps = np.nan_to_num(padded[_SPEED_STEPS:] - padded[:-_SPEED_STEPS]).tolist()
+    contradicted = {steps[row]: leaps[row] for row in np.flatnonzero(solved.contradicted)}
     return Scale(unit.mode, estimate, per_frame, lengths, named, contradicted)
 
 

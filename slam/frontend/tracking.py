@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import NamedTuple, Self
 
 import cv2
@@ -154,26 +154,24 @@ def new_corners(
     if frame.fixed is not None:
         free[resized_mask(frame.fixed, *grey.shape[::-1])] = 0
     tiles, ranks = [_NOTHING[0]], [_NOTHING[1]]
-    for top, bottom in pairwise(np.linspace(0, grey.shape[0], _TILES[0] + 1).astype(int)):
-        for left, right in pairwise(np.linspace(0, grey.shape[1], _TILES[1] + 1).astype(int)):
-            tile, mask = (
-                grey[top:bottom, left:right],
-                np.ascontiguousarray(free[top:bottom, left:right]),
-            )
-            corners = cv2.goodFeaturesToTrack(
-                tile,
-                count,
-                texture.quality,
-                texture.spacing_px,
-                mask=mask,
-                blockSize=texture.block_px,
-            )
-            if corners is not None:
-                before = np.count_nonzero(
-                    ((taken >= (left, top)) & (taken < (right, bottom))).all(axis=1)
-                )
-                tiles.append(corners.reshape(-1, 2) + np.array([left, top], np.float32))
-                ranks.append(before + np.arange(len(corners)))
+    down, across = (
+        pairwise(np.linspace(0, side, number + 1).astype(int))
+        for side, number in zip(grey.shape, _TILES, strict=True)
+    )
+    for (top, bottom), (left, right) in product(down, across):
+        tile = slice(top, bottom), slice(left, right)
+        corners = cv2.goodFeaturesToTrack(
+            grey[tile],
+            count,
+            texture.quality,
+            texture.spacing_px,
+            mask=free[tile],
+            blockSize=texture.block_px,
+        )
+        if corners is not None:
+            before = ((taken >= (left, top)) & (taken < (right, bottom))).all(axis=1).sum()
+            tiles.append(corners.reshape(-1, 2) + np.array([left, top], np.float32))
+            ranks.append(before + np.arange(len(corners)))
     order = np.argsort(np.concatenate(ranks), kind="stable")[:count]
     return np.concatenate(tiles)[order]
 

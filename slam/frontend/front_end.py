@@ -17,7 +17,7 @@ from slam.frontend.keyframes.submaps import parts_of
 from slam.frontend.keyframes.units import learned_unit
 from slam.frontend.measured import LAST_STEPS, FrontEnd, Measured
 from slam.frontend.visual.step_tracker import Beside, Seen, StepTracker
-from slam.geometry.se3 import FloatArray, invert, length_of
+from slam.geometry.se3 import FloatArray, invert, length_of, normalised
 from slam.runtime.errors import Failed
 from slam.runtime.stopwatch import Stopwatch
 
@@ -194,7 +194,7 @@ def _is_on_vehicle(measured: Measured) -> bool | None:
     speeds = [motion.length_unscaled / motion.seconds for motion in first]
     is_fast = bool(heights) and bool(np.median(speeds) >= _VEHICLE_SPEED * np.median(heights))
     steps = np.array([motion.relative_pose.T_from_to[:3, 3] for motion in first])
-    directions = steps / np.linalg.norm(steps, axis=1, keepdims=True)
+    directions = normalised(steps)
     usual = np.median(directions, axis=0)
     cosine = directions @ usual / max(length_of(usual), 1e-9)
     scatter_deg = float(np.rad2deg(np.arccos(np.clip(np.median(cosine), -1.0, 1.0))))

@@ -165,14 +165,14 @@ def _completed(known: Mapping[int, FloatArray], steps: Collection[int]) -> dict[
     found = np.empty((len(unknown), 6))
     for row, step in enumerate(unknown):
         after = int(np.searchsorted(numbers, step))
-        before = slice(max(after - _STEPS_OF_A_MOTION, 0), after)
-        means, distances = [], []
-        for part in (before, slice(after, after + _STEPS_OF_A_MOTION)):
-            if len(numbers[part]):
-                means.append(motion[part].mean(axis=0))
-                distances.append(np.abs(numbers[part] - step).min())
-        weights = np.array(distances, np.float64)[::-1]  # of two, the nearer mean weighs more
-        found[row] = weights @ np.array(means) / weights.sum()
+        parts = (
+            motion[max(after - _STEPS_OF_A_MOTION, 0) : after],
+            motion[after:][:_STEPS_OF_A_MOTION],
+        )
+        means = [part.mean(axis=0) for part in parts if len(part)]
+        # of two, the nearer mean weighs more
+        share = np.interp(step, numbers[max(after - 1, 0) : after + 1], range(len(means)))
+        found[row] = means[0] + share * (means[-1] - means[0])
     T = from_rotation_vector(found[:, :3], found[:, 3:])
     return {**known, **dict(zip(unknown, T, strict=True))}
 

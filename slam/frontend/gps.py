@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
+from scipy.spatial.transform import Rotation
 
 from slam.config.sections import GpsConfig
 from slam.formats.trajectory import nearest_stamps
@@ -130,7 +132,7 @@ class GpsFixes:
         if not known.any():
             return None
         speeds = np.interp(self.stamps, self.stamps[known], self._speeds[known])
-        driven = np.r_[0.0, np.cumsum(np.diff(self.stamps) * (speeds[1:] + speeds[:-1]) / 2)]
+        driven = cumulative_trapezoid(speeds, self.stamps, initial=0)
         path = np.interp(self.stamps, self._frame_stamps, se3.path_distance(T_world_camera))
         edges = np.arange(0, len(path), max(len(path) // _CHORDS, 1))
         by_gps, by_camera = np.diff(driven[edges]), np.diff(path[edges])
@@ -221,16 +223,10 @@ class LocalFrame:
 
     def __init__(self, place: FloatArray) -> None:
         """At a place ``(3,)``: latitude and longitude in degrees, height in metres."""
-        latitude, longitude = np.deg2rad(place[:2])
-        north_of, east_of = np.sin(latitude), np.sin(longitude)
-        along, level = np.cos(latitude), np.cos(longitude)
-        R_earth_local = np.array(
-            [
-                [-east_of, -north_of * level, along * level],
-                [level, -north_of * east_of, along * east_of],
-                [0.0, along, north_of],
-            ]
-        )
+        latitude, longitude = place[:2]
+        # about the axis of the earth until x is east, then about that until z is up
+        turns = [90.0 + longitude, 90.0 - latitude]
+        R_earth_local = Rotation.from_euler("ZX", turns, degrees=True).as_matrix()
         self._T_earth_local = se3.make(R_earth_local, _earth_centred(place[None])[0])
 
     def points(self, places: FloatArray) -> FloatArray:
@@ -246,12 +242,8 @@ class LocalFrame:
             z + _E2_SECOND * _B * np.sin(parametric) ** 3,
             radius - _E2 * _A * np.cos(parametric) ** 3,
         )
-        normal = _A / np.sqrt(1.0 - _E2 * np.sin(latitude) ** 2)
-        height = (
-            radius * np.cos(latitude)
-            + z * np.sin(latitude)
-            - normal * (1.0 - _E2 * np.sin(latitude) ** 2)
-        )
+        north, outward = np.sin(latitude), np.cos(latitude)
+        height = radius * outward + z * north - _A * np.sqrt(1.0 - _E2 * north**2)
         return np.column_stack([np.rad2deg(latitude), np.rad2deg(np.arctan2(y, x)), height])
 
 

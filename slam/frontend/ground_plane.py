@@ -43,20 +43,14 @@ class GroundPlaneFitter:
             intrinsics.width * (bottom_row - top_row) * (_ROAD_TOP_WIDTH + _ROAD_BOTTOM_WIDTH) / 2
         )
         step = max(1.0, float(np.sqrt(max(area, 1.0) / _POINTS)))
-        rows_seen = np.unique(
-            np.clip(np.arange(top_row, bottom_row, step), 0, bottom).astype(np.int64)
-        )
-        rows, columns = [], []
-        for row in rows_seen:
-            share = (row - top_row) / (bottom_row - top_row)
-            width = _ROAD_TOP_WIDTH + share * (_ROAD_BOTTOM_WIDTH - _ROAD_TOP_WIDTH)
-            half = width * intrinsics.width / 2
-            across = np.arange(intrinsics.cx - half, intrinsics.cx + half, step)
-            across = np.unique(across[(across >= 0) & (across < intrinsics.width)].astype(np.int64))
-            columns.append(across)
-            rows.append(np.full(len(across), row))
-        empty = [np.empty(0, dtype=np.int64)]
-        v, u = np.concatenate(rows or empty), np.concatenate(columns or empty)
+        rows = np.arange(top_row, bottom_row, step).clip(0, bottom).astype(np.int64)[:, None]
+        share = (rows - top_row) / (bottom_row - top_row)
+        width = _ROAD_TOP_WIDTH + share * (_ROAD_BOTTOM_WIDTH - _ROAD_TOP_WIDTH)
+        half = width * intrinsics.width / 2
+        # every row from the left edge of the road to the right one
+        across = intrinsics.cx - half + np.arange(0.0, _ROAD_BOTTOM_WIDTH * intrinsics.width, step)
+        is_road = (across < intrinsics.cx + half) & (across >= 0) & (across < intrinsics.width)
+        v, u = np.broadcast_to(rows, across.shape)[is_road], across[is_road].astype(np.int64)
         self._rows, self._columns, self._rays = v, u, intrinsics.rays(np.stack([u, v], axis=-1))
 
     def fit(self, depth_unscaled: DepthMap, error: DepthError) -> float | Failed:

@@ -31,6 +31,7 @@ from slam.geometry.se3 import (
     interpolated,
     invert,
     length_of,
+    normalised,
     path_distance,
 )
 from slam.runtime.errors import Failed
@@ -260,9 +261,7 @@ def with_slope(road_steps: Mapping[Ends, RoadStep], steps: Steps) -> dict[Ends, 
     T_current_previous = invert(
         np.array([motion.relative_pose.T_from_to for motion in motions.values()])
     )
-    own = -T_current_previous[:, :3, 3] / np.linalg.norm(
-        T_current_previous[:, :3, 3], axis=1, keepdims=True
-    )
+    own = -normalised(T_current_previous[:, :3, 3])
     usual = np.column_stack([running_median(axis, _USUAL_STEPS) for axis in own.T])
     around = np.array(
         [by_path.get(ends[1], often) for ends, often in zip(motions, usual, strict=True)]
@@ -390,4 +389,4 @@ def _ahead(points: _Layer) -> _Layer:
 
 
 def _correlation(a: _Layer, b: _Layer) -> float:
-    return float((a * b).sum() / max(float(np.sqrt((a**2).sum() * (b**2).sum())), 1e-9))
+    return float(a @ b) / max(length_of(a) * length_of(b), 1e-9)

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import bsr_array, csr_array, diags_array
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
@@ -22,13 +22,12 @@ from slam.frontend.visual.motion import (
     shortest_by_start,
     triangulated,
 )
-from slam.geometry.se3 import FloatArray, invert
+from slam.geometry.se3 import FloatArray, invert, normalised
 
 # sigmas of single steps are widened by this: the errors of neighbouring steps are correlated
 _STEP_WIDENING = 3.0
 _ITERATIONS = 4
 _OUTLIER_SIGMAS = 3.0
-_BLOCK = np.arange(9)
 
 
 def smooth_rotations(steps: Steps, relative_rotations: Mapping[Ends, RelativeRotation]) -> Steps:
@@ -56,7 +55,7 @@ def smooth_rotations(steps: Steps, relative_rotations: Mapping[Ends, RelativeRot
     overlapping = max(len(path) for _, path in usable)
     sigmas = np.concatenate([motion.relative_pose.sigmas[:3] for motion in motions.values()])
     own = 1.0 / (_STEP_WIDENING * sigmas) ** 2
-    prior = coo_array((own, (np.arange(len(own)),) * 2)).tocsr()
+    prior = diags_array(own)
     correction = np.zeros(len(own))
     for _ in range(_ITERATIONS):
         residual = np.linalg.norm((A @ correction - target).reshape(-1, 3), axis=1)
@@ -72,7 +71,7 @@ def smooth_rotations(steps: Steps, relative_rotations: Mapping[Ends, RelativeRot
     directions = T_current_previous[:, :3, 3]
     lengths = np.linalg.norm(directions, axis=1, keepdims=True)
     turned = directions + lengths * moves[:, :, 0]
-    T_current_previous[:, :3, 3] = turned * lengths / np.linalg.norm(turned, axis=1, keepdims=True)
+    T_current_previous[:, :3, 3] = lengths * normalised(turned)
     smoothed = dict(steps)
     for motion, T in zip(motions.values(), invert(T_current_previous), strict=True):
         pose = replace(motion.relative_pose, T_from_to=T)
@@ -85,20 +84,17 @@ def _equations(
     usable: Sequence[tuple[RelativeRotation, list[Ends]]],
 ) -> tuple[csr_array, FloatArray]:
     """Whitened equations of all relative rotations in the corrections of steps: matrix and right side."""
-    place = {ends: 3 * n for n, ends in enumerate(R_current_previous)}
-    rows, columns, entries, R_residual = [], [], [], []
-    for n, (rotation, path) in enumerate(usable):
+    place = {ends: n for n, ends in enumerate(R_current_previous)}
+    blocks, columns, begins, R_residual = [], [], [0], []
+    for rotation, path in usable:
         R_last_step = np.eye(3)
         for ends in reversed(path):
-            rows.append(3 * n + _BLOCK // 3)
-            columns.append(place[ends] + _BLOCK % 3)
-            entries.append((R_last_step / rotation.sigmas[:, None]).ravel())
+            columns.append(place[ends])
+            blocks.append(R_last_step / rotation.sigmas[:, None])
             R_last_step = R_last_step @ R_current_previous[ends]
+        begins.append(len(columns))
         R_residual.append(rotation.R_to_from @ R_last_step.T)
     sigmas = np.array([rotation.sigmas for rotation, _ in usable])
     target = Rotation.from_matrix(np.array(R_residual)).as_rotvec() / sigmas
     shape = 3 * len(usable), 3 * len(place)
-    A = coo_array(
-        (np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=shape
-    )
-    return A.tocsr(), target.ravel()
+    return bsr_array((np.array(blocks), columns, begins), shape=shape).tocsr(), target.ravel()

@@ -23,6 +23,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.linalg import cholesky_banded, solveh_banded
+from scipy.ndimage import convolve1d
 
 from slam.config.sections import ScaleMode
 from slam.frames import Ends, RelativePose
@@ -223,12 +224,10 @@ def find_scale(unit: Unit, drive: Drive, lidar_steps: Sequence[RelativePose] = (
     rows = zip(steps, np.transpose(values).tolist(), strict=True)
     lengths = {ends: StepLength(*row) for ends, row in rows if np.isfinite(row[0])}
     log_speed = running_median(np.log(solved.length / evidence.seconds), _SPEED_STEPS)
-    at = np.flatnonzero(solved.contradicted)
-    # the middles of the windows that end before such a step and begin with it
-    middles = np.add.outer([-_SPEED_STEPS // 2, _SPEED_STEPS // 2], at)
-    around = log_speed[np.clip(middles, 0, len(steps) - 1)]
-    (leaps,) = np.nan_to_num(np.diff(around, axis=0)).tolist()
-    contradicted = {steps[row]: leap for row, leap in zip(at.tolist(), leaps, strict=True)}
+    # from the window that ends before each step to that which begins with it
+    padded = np.pad(log_speed, (_SPEED_STEPS // 2 + 1, _SPEED_STEPS // 2), mode="edge")
+    leaps = np.nan_to_num(padded[_SPEED_STEPS:] - padded[:-_SPEED_STEPS]).tolist()
+    contradicted = {steps[row]: leaps[row] for row in np.flatnonzero(solved.contradicted)}
     return Scale(unit.mode, estimate, per_frame, lengths, named, contradicted)
 
 
@@ -304,15 +303,10 @@ class StepEvidence:
 
         By how they change against the lengths that points give, over some steps.
         """
-        change = np.concatenate([[0.0], np.diff(self.learned) - self.ratio[1:]])
-        is_known = np.isfinite(change)
-        summed = np.cumsum(np.where(is_known, change, 0.0))
-        gaps = np.cumsum(~is_known)
-        whole = gaps[_NOISE_STEPS:] == gaps[:-_NOISE_STEPS]
-        over_steps = (summed[_NOISE_STEPS:] - summed[:-_NOISE_STEPS])[whole]
-        if len(over_steps) < _NOISE_STEPS:
-            return 1.0
-        return max(rms(over_steps) / _USUAL_NOISE, 1.0)
+        change = np.diff(self.learned) - self.ratio[1:]
+        over_steps = convolve1d(change, np.ones(_NOISE_STEPS), mode="constant", cval=np.nan)
+        whole = over_steps[np.isfinite(over_steps)]
+        return max(rms(whole) / _USUAL_NOISE, 1.0) if len(whole) >= _NOISE_STEPS else 1.0
 
     def steady_sigma(self, log_length: FloatArray, camera_height: float) -> FloatArray:
         """By how much a vehicle's acceleration changes the logarithm of its speed from step to step ``(S - 1,)``.

@@ -30,7 +30,7 @@ from slam.frames import Frame, Intrinsics
 from slam.frontend.followed_corners import FollowedCorners, follow
 from slam.geometry.multiview import LEAST_DEPTH, pixel_jacobian, rotation_between
 from slam.geometry.robust import mad_sigma, weighted_median
-from slam.geometry.se3 import FloatArray, compose, from_rotation_vector, invert, make
+from slam.geometry.se3 import FloatArray, compose, from_rotation_vector, invert, make, normalised
 
 MOST_FRAMES = 450
 SURE, ROUGH = 0.05, 0.12  # relative sigmas below which a focal length is found, or roughly
@@ -156,7 +156,7 @@ class Reconstruction:
 
     def stretched(self, ratio: float) -> Reconstruction:
         """The same images under a focal length so many times as long, to first order in the turns."""
-        points = _normalised(self.points * [1.0, 1.0, ratio, 1.0])
+        points = normalised(self.points * [1.0, 1.0, ratio, 1.0])
         centres = invert(self.T_camera_world)[:, :3, 3] * [1.0, 1.0, ratio]
         turns = self.turns
         aside = np.maximum(np.linalg.norm(turns[:, :2], axis=1), 1e-9)
@@ -377,7 +377,7 @@ class Problem:
         T, lens = start.T_camera_world.copy(), start.lens.copy()
         T[1:] = compose(from_rotation_vector(moves[:, :3], moves[:, 3:]), T[1:])
         lens[first:] += step[n:]
-        return Reconstruction(T, _normalised(start.points + by_point), lens)
+        return Reconstruction(T, normalised(start.points + by_point), lens)
 
 
 class _System(NamedTuple):
@@ -414,10 +414,10 @@ def _turning(seen: FollowedCorners) -> tuple[Problem, Reconstruction] | None:
         return None
     R_camera_world, rows = np.array(R), seen.keyframe < len(R)
     part, points = seen.chosen(rows, least=2)
-    rays = _normalised(rays[rows & np.isin(seen.point, points)])
+    rays = normalised(rays[rows & np.isin(seen.point, points)])
     in_world = np.einsum("sji,sj->si", R_camera_world[part.keyframe], rays)
-    directions = _normalised(_sums(in_world, part.point, len(points)))
-    far = _normalised(np.column_stack([directions, np.full(len(points), _NEARNESS)]))
+    directions = normalised(_sums(in_world, part.point, len(points)))
+    far = normalised(np.column_stack([directions, np.full(len(points), _NEARNESS)]))
     places = _APART * np.random.default_rng(0).normal(size=(len(R), 3))
     start = Reconstruction(make(R_camera_world, places), far, _PRIOR)
     problem = Problem(part)
@@ -444,7 +444,3 @@ def _sums(values: FloatArray, groups: NDArray[np.int64], count: int) -> FloatArr
     """Sums ``(count, ...)`` of the values ``(S, ...)`` of each group ``(S,)``."""
     own = csr_array((np.ones(len(groups)), (groups, np.arange(len(groups)))), (count, len(groups)))
     return (own @ values.reshape(len(values), -1)).reshape(count, *values.shape[1:])
-
-
-def _normalised(vectors: FloatArray) -> FloatArray:
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

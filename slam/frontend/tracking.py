@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import NamedTuple, Self
 
 import cv2
@@ -154,39 +154,34 @@ def new_corners(
     if frame.fixed is not None:
         free[resized_mask(frame.fixed, *grey.shape[::-1])] = 0
     tiles, ranks = [_NOTHING[0]], [_NOTHING[1]]
-    for top, bottom in pairwise(np.linspace(0, grey.shape[0], _TILES[0] + 1).astype(int)):
-        for left, right in pairwise(np.linspace(0, grey.shape[1], _TILES[1] + 1).astype(int)):
-            tile, mask = (
-                grey[top:bottom, left:right],
-                np.ascontiguousarray(free[top:bottom, left:right]),
-            )
-            corners = cv2.goodFeaturesToTrack(
-                tile,
-                count,
-                texture.quality,
-                texture.spacing_px,
-                mask=mask,
-                blockSize=texture.block_px,
-            )
-            if corners is not None:
-                before = np.count_nonzero(
-                    ((taken >= (left, top)) & (taken < (right, bottom))).all(axis=1)
-                )
-                tiles.append(corners.reshape(-1, 2) + np.array([left, top], np.float32))
-                ranks.append(before + np.arange(len(corners)))
+    down, across = (
+        pairwise(np.linspace(0, side, number + 1).astype(int))
+        for side, number in zip(grey.shape, _TILES, strict=True)
+    )
+    for (top, bottom), (left, right) in product(down, across):
+        tile = slice(top, bottom), slice(left, right)
+        corners = cv2.goodFeaturesToTrack(
+            grey[tile],
+            count,
+            texture.quality,
+            texture.spacing_px,
+            mask=free[tile],
+            blockSize=texture.block_px,
+        )
+        if corners is not None:
+            before = ((taken >= (left, top)) & (taken < (right, bottom))).all(axis=1).sum()
+            tiles.append(corners.reshape(-1, 2) + np.array([left, top], np.float32))
+            ranks.append(before + np.arange(len(corners)))
     order = np.argsort(np.concatenate(ranks), kind="stable")[:count]
     return np.concatenate(tiles)[order]
 
 
 def _away_from(pixels: Pixels, radius: int, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     """A mask ``(H, W)``, zero within ``radius`` of pixels ``(M, 2)`` inside of it."""
-    height, width = shape[0] + 2 * radius, shape[1] + 2 * radius
-    disc = np.zeros((2 * radius + 1,) * 2, np.uint8)
-    rows, columns = np.nonzero(cv2.circle(disc, (radius, radius), radius, 1, -1))
-    u, v = np.rint(pixels).astype(np.int64).T
-    mask = np.full(height * width, 255, np.uint8)
-    mask[np.add.outer(v * width + u, rows * width + columns)] = 0
-    return mask.reshape(height, width)[radius : height - radius, radius : width - radius]
+    mask = np.full(shape, 255, np.uint8)
+    for centre in np.rint(pixels).astype(np.int64).tolist():
+        cv2.circle(mask, centre, radius, 0, thickness=-1)
+    return mask
 
 
 @dataclass(frozen=True)

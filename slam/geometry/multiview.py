@@ -25,6 +25,7 @@ from slam.geometry.se3 import (
     length_of,
     make,
     nearest_rotation,
+    normalised,
     rotation_matrix,
 )
 
@@ -66,11 +67,7 @@ class Resection:
 
 
 def ransac_order(count: int, seed: int) -> NDArray[np.intp]:
-    """The order ``(count,)`` of the points for a RANSAC method of OpenCV's; 0 is the given one.
-
-    Some methods have a fixed seed, others that of OpenCV, which is set too.
-    """
-    cv2.setRNGSeed(seed)
+    """The order ``(count,)`` of the points for a RANSAC of OpenCV, whose own seed is fixed; 0 is the given one."""
     order = np.arange(count, dtype=np.intp)
     return order if seed == 0 else np.random.default_rng(seed).permutation(order)
 
@@ -278,10 +275,10 @@ def unit_pose_by_essential(
         seed: of the draws.
     """
     order = ransac_order(len(rays_previous), seed)
-    rays_previous, rays_current = rays_previous[order], rays_current[order]
+    previous, current = rays_previous[order, :2], rays_current[order, :2]
     E, mask = cv2.findEssentialMat(
-        rays_previous[:, :2].copy(),
-        rays_current[:, :2].copy(),
+        previous,
+        current,
         np.eye(3),
         method=cv2.USAC_MAGSAC,
         prob=0.999,
@@ -290,20 +287,11 @@ def unit_pose_by_essential(
     )
     if E is None or E.shape != (3, 3) or int(mask.sum()) < _LEAST_CONSENSUS:
         return None
-    inliers = mask.ravel().astype(bool)
-    rays_previous, rays_current = rays_previous[inliers], rays_current[inliers]
-    R, R_twisted, direction = cv2.decomposeEssentialMat(E)
-    unit_poses = [
-        UnitRelativePose(rotated, sign * direction.ravel())
-        for rotated in (R, R_twisted)
-        for sign in (1.0, -1.0)
-    ]
-
-    def in_front_of_both(unit_pose: UnitRelativePose) -> int:
-        depth = triangulated_depth(rays_previous, rays_current, unit_pose)
-        return int(((depth > 0) & (depth_in_current(rays_previous, depth, unit_pose) > 0)).sum())
-
-    return max(unit_poses, key=in_front_of_both)
+    # of four motions that explain it, the one by which most points are in front of both cameras
+    _, R_current_previous, direction, _, _ = cv2.recoverPose(
+        E, previous, current, np.eye(3), distanceThresh=np.inf, mask=mask
+    )
+    return UnitRelativePose(R_current_previous, direction.ravel())
 
 
 def unit_poses_by_homography(
@@ -372,7 +360,7 @@ def parallax_px(
     rays_previous: FloatArray,
     rays_current: FloatArray,
     R_current_previous: FloatArray,
-    focal: tuple[float, float],
+    focal: tuple[float, float] | float,
 ) -> FloatArray:
     """Optical flow of each point in pixels ``(M,)`` without that of the rotation.
 
@@ -380,10 +368,10 @@ def parallax_px(
         rays_previous: ``(M, 3)`` with z = 1, in the previous camera.
         rays_current: of the same points ``(M, 3)`` with z = 1, in the current one.
         R_current_previous: the rotation ``(3, 3)`` between them.
-        focal: both focal lengths, pixels.
+        focal: both focal lengths, or one for both, pixels.
     """
     rotated = rays_previous @ R_current_previous.T
-    rotated = rotated[:, :2] / np.where(rotated[:, 2:] > 1e-6, rotated[:, 2:], 1e-6)
+    rotated = rotated[:, :2] / np.maximum(rotated[:, 2:], 1e-6)
     difference = (rays_current[:, :2] - rotated) * focal
     return np.linalg.norm(difference, axis=1)
 
@@ -393,8 +381,7 @@ def rotation_between(rays_previous: FloatArray, rays_current: FloatArray) -> Flo
 
     Orthogonal Procrustes on unit rays, trimmed to the better three quarters, so that dynamic objects do not bias it.
     """
-    unit_previous = rays_previous / np.linalg.norm(rays_previous, axis=1, keepdims=True)
-    unit_current = rays_current / np.linalg.norm(rays_current, axis=1, keepdims=True)
+    unit_previous, unit_current = normalised(rays_previous), normalised(rays_current)
     kept = np.ones(len(unit_previous), dtype=bool)
     most = 3 * len(unit_previous) // 4
     for _ in range(_TRIMMINGS):

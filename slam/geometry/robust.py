@@ -68,12 +68,12 @@ def difference_equations(
     Returns:
         The upper band ``(3, N)`` of the normal matrix, and the right side ``(N,)``.
     """
-
-    def added(places: NDArray[np.intp], values: FloatArray) -> FloatArray:
-        return np.asarray(np.bincount(places, values, len(idle) + 1)[: len(idle)], np.float64)
-
-    later, apart = np.maximum(plus, minus), np.abs(plus - minus)
-    off_diagonal = (-added(later, np.where(apart == distance, weights, 0.0)) for distance in (2, 1))
-    diagonal = idle + added(plus, weights) + added(minus, weights)
-    right = added(plus, weights * value) - added(minus, weights * value)
-    return np.array([*off_diagonal, diagonal]), right
+    band, right = np.zeros((3, len(idle) + 1)), np.zeros(len(idle) + 1)
+    band[2, :-1] = idle
+    for places, signed in ((plus, weights), (minus, -weights)):
+        np.add.at(band[2], places, weights)
+        np.add.at(right, places, signed * value)
+    # the place behind the last state is far from others, and left out
+    apart = np.minimum(np.abs(plus - minus), 2)
+    np.subtract.at(band, (2 - apart, np.maximum(plus, minus)), weights)
+    return band[:, :-1], right[:-1]

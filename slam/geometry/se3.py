@@ -45,19 +45,14 @@ def length_of(vector: ArrayLike) -> float:
     return float(np.linalg.norm(vector))
 
 
-def rotation_angle(R: FloatArray) -> FloatArray:
-    """Angle in radians of rotations ``(..., 3, 3)``, in [0, pi], accurate at both ends.
+def normalised(vectors: FloatArray) -> FloatArray:
+    """The vectors ``(N, D)`` at unit length."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
-    The sine comes from the skew part and the cosine from the trace, so neither end loses digits.
-    """
-    skew = np.stack(
-        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]],
-        axis=-1,
-    )
-    sine = np.linalg.norm(skew, axis=-1)
-    cosine = np.trace(R, axis1=-2, axis2=-1) - 1.0
-    angle: FloatArray = np.arctan2(sine, cosine)
-    return angle
+
+def rotation_angle(R: FloatArray) -> FloatArray:
+    """Angle in radians of a rotation ``(3, 3)`` or of many ``(N, 3, 3)``, in [0, pi], accurate at both ends."""
+    return np.asarray(Rotation.from_matrix(R).magnitude())
 
 
 def compose(T_a_b: FloatArray, T_b_c: FloatArray) -> FloatArray:
@@ -139,11 +134,7 @@ def is_se3(T_a_b: FloatArray, tolerance: float = 1e-5) -> bool:
     """Whether every matrix of the stack is a finite rigid transform."""
     if T_a_b.shape[-2:] != (4, 4) or not np.isfinite(T_a_b).all():
         return False
-    R = T_a_b[..., :3, :3]
-    orthogonal = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max() < tolerance
-    right_handed = bool((np.linalg.det(R) > 0).all())
-    affine = np.abs(T_a_b[..., 3, :] - [0.0, 0.0, 0.0, 1.0]).max() < tolerance
-    return bool(orthogonal and right_handed and affine)
+    return np.allclose(T_a_b, rigid(T_a_b), rtol=0.0, atol=tolerance)
 
 
 @dataclass(frozen=True)
@@ -170,11 +161,10 @@ def umeyama(points_a: FloatArray, points_b: FloatArray, with_scale: bool) -> Sim
     """
     mean_a, mean_b = points_a.mean(axis=0), points_b.mean(axis=0)
     centred_a, centred_b = points_a - mean_a, points_b - mean_b
-    U, singular, Vt = np.linalg.svd(centred_a.T @ centred_b / len(points_a))
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
-    R_a_b = U @ np.diag(sign) @ Vt
-    variance_b = (centred_b**2).sum() / len(points_b)
-    scale = float(singular @ sign / variance_b) if with_scale and variance_b > 0 else 1.0
+    covariance = centred_a.T @ centred_b
+    R_a_b, variance_b = nearest_rotation(covariance), (centred_b**2).sum()
+    is_scaled = with_scale and variance_b > 0
+    scale = float((R_a_b * covariance).sum() / variance_b) if is_scaled else 1.0
     return Similarity(scale, R_a_b, mean_a - scale * R_a_b @ mean_b)
 
 

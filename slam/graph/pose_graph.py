@@ -223,7 +223,7 @@ class PoseGraph:
     def _values(self, T_world_camera: FloatArray) -> Any:
         values = gtsam.Values()
         for k, T in enumerate(self.T_fixed_world @ T_world_camera):
-            values.insert(k, _pose3(T))
+            values.insert(k, gtsam.Pose3(T))
         return values
 
     def _factors(self, values: Any) -> Any:
@@ -236,7 +236,7 @@ class PoseGraph:
             noise = robust_noise(edge.graph_sigmas)
             graph.add(
                 gtsam.BetweenFactorPose3(
-                    edge.from_index, edge.to_index, _pose3(edge.T_from_to), noise
+                    edge.from_index, edge.to_index, gtsam.Pose3(edge.T_from_to), noise
                 )
             )
         for frame, position, own in self._positions:
@@ -254,7 +254,7 @@ def whitened_squared(
     squared = []
     for edge in relative_poses:
         T_from_to = invert(T_world_camera[edge.from_index]) @ T_world_camera[edge.to_index]
-        residual = gtsam.Pose3.Logmap(_pose3(edge.T_from_to).between(_pose3(T_from_to)))
+        residual = gtsam.Pose3.Logmap(gtsam.Pose3(edge.T_from_to).between(gtsam.Pose3(T_from_to)))
         squared.append(float(((residual / edge.sigmas) ** 2).sum()))
     return np.array(squared)
 
@@ -281,10 +281,6 @@ def robust_noise(sigmas: FloatArray) -> Any:
     """GTSAM's model of independent errors with these sigmas and Huber's loss."""
     noise: Any = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(sigmas, dtype=np.float64))
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER_K), noise)
-
-
-def _pose3(T_a_b: FloatArray) -> Any:
-    return gtsam.Pose3(gtsam.Rot3(T_a_b[:3, :3]), T_a_b[:3, 3])
 
 
 def optimise_similarities(

@@ -68,7 +68,7 @@ def rotation_jitter(rotations: FloatArray) -> FloatArray:
     jumps. Zero with few steps. The vectors ``(S, 3)`` are in the order of the drive, NaN where
     unknown.
     """
-    third = rotations[3:] - 3 * rotations[2:-1] + 3 * rotations[1:-2] - rotations[:-3]
+    third = np.diff(rotations, n=3, axis=0)
     third = third[np.isfinite(third).all(axis=1)]
     if len(third) < _LEAST_DIFFERENCES:
         return np.zeros(3)

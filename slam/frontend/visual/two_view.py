@@ -25,6 +25,7 @@ from slam.frontend.visual.history import AXIS_SIGMA, MotionHistory, MotionPrior
 from slam.geometry.multiview import (
     UnitRelativePose,
     cross,
+    parallax_px,
     triangulated_depth,
     unit_pose_by_essential,
     unit_pose_by_pnp,
@@ -104,9 +105,8 @@ class Matches:
         """Learned over triangulated depth of corners with parallax near their epipolar lines, and that parallax."""
         distance, _ = self.residuals.across(unit_pose, tangent_of(unit_pose.direction))
         depth = triangulated_depth(self.rays_previous, self.rays_current, unit_pose)
-        rotated = unit_pose.R_current_previous @ self.rays_previous.T
-        shift = self.rays_current.T[:2] - rotated[:2] / np.maximum(rotated[2], 1e-6)
-        shift_px = np.hypot(*shift) * self.focal_px
+        rotation = unit_pose.R_current_previous
+        shift_px = parallax_px(self.rays_previous, self.rays_current, rotation, self.focal_px)
         usable = (np.abs(distance) < INLIER_PX) & (depth > 0) & (shift_px > 1.0)
         usable &= np.isfinite(self.depth_previous)
         return np.asarray(self.depth_previous[usable] / depth[usable]), np.asarray(shift_px[usable])

@@ -198,25 +198,19 @@ def _oxts_poses(
     if not path.exists():
         logger.warning("no %s: the drive has no reference poses", path)
         return None
-    found = sorted(folder.glob("*.txt"))
-    packets = by_number(found) if found else None
-    paths = {int(path.stem): path for path in found}
-    rows = (
-        range(len(files))
-        if all(files.first + row in paths for row in range(len(files)))
-        else files.rows
-    )
-    if packets is None or not all(files.first + row in paths for row in rows):
+    packets = _readers(kitti.read_packet, folder, "*.txt", files)
+    if not packets.keys() >= set(files.rows):
         raise SequenceError(
-            f"{folder} has {len(paths)} packets for {len(files.paths)} images: restore what is missing, or remove "
+            f"{folder} has {len(packets)} packets for {len(files.paths)} images: restore what is missing, or remove "
             f"oxts to run without a reference"
         )
-    known = np.array(rows)
+    known = np.array([row for row in range(len(files)) if row in packets])
     ages_s = np.zeros(len(known))
-    packet_times = _dates(drive / "oxts" / "timestamps.txt", packets)
+    numbered = by_number(sorted(folder.glob("*.txt")))
+    packet_times = _dates(drive / "oxts" / "timestamps.txt", numbered)
     if image_times is not None and packet_times is not None:
-        ages_s = image_times[known] - packet_times[known + files.first - packets.first]
-    content = np.array([kitti.read_packet(paths[files.first + row]) for row in rows])
+        ages_s = image_times[known] - packet_times[known + files.first - numbered.first]
+    content = np.array([packets[row]() for row in known.tolist()])
     T_camera_imu = T_camera_lidar @ CalibrationFile(path).transform("R", "T")
     T_world_camera = T_world_imu(content, ages_s) @ se3.invert(T_camera_imu)
     if len(known) < len(files):

@@ -333,14 +333,12 @@ def _read_numbers(
     lines, rows, numbers = [], [], []
     for row, (line, words) in enumerate(table):
         values = list(map(number_or_nan, words))
-        odd = next((word for word in words if not is_number(word)), None)
+        odd = next((word for word, value in zip(words, values) if not math.isfinite(value)), None)
         if len(words) != columns:
             bad.add(line, f"{len(words)} columns; a KITTI row has 12, a TUM row 8")
         elif odd is not None:
-            hint = "; decimals are written with a point" if is_number(odd.replace(",", ".")) else ""
-            bad.add(line, f"not a number: {odd!r}{hint}")
-        elif not all(map(math.isfinite, values)):
-            bad.add(line, "a number is not finite")
+            hint = "; decimals are written with a point" if "," in odd else ""
+            bad.add(line, f"not a finite number: {odd!r}{hint}")
         else:
             numbers.append(values)
             lines.append(line)

@@ -85,7 +85,7 @@ def test_tum_round_trip_keeps_every_digit_of_a_stamp(tmp_path: Path, format: str
         (
             TUM.replace(".", ","),
             "auto",
-            "line 1: not a number: '0,1'; decimals are written with a point",
+            "line 1: not a finite number: '0,1'; decimals are written with a point",
         ),
         (f"{TUM}\n{TUM}\n", "auto", "line 2: time stamps must increase"),
         (

@@ -6,6 +6,7 @@ Conventions: ``docs/design/conventions.md``. Quaternions are those of TUM files.
 from __future__ import annotations
 
 import logging
+import math
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam.formats.rows import BadRows, in_seconds, is_number, rows_of
+from slam.formats.rows import BadRows, in_seconds, is_number, number_or_nan, rows_of
 from slam.geometry import se3
 from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray
@@ -125,10 +126,7 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
     lines, rows, numbers = _read_numbers(
         path, _COLUMNS.get(format, _COLUMNS["kitti"] + _COLUMNS["tum"]), bad
     )
-    columns, is_finite = numbers.shape[1], np.isfinite(numbers).all(axis=1)
-    lines, rows, numbers = bad.without(
-        [(is_finite, "a number is not finite")], lines, rows, numbers
-    )
+    columns = numbers.shape[1]
     if columns in _COLUMNS["kitti"]:
         T_world_camera = np.tile(np.eye(4), (len(numbers), 1, 1))
         T_world_camera[:, :3] = numbers[:, columns % 4 :][:, :12].reshape(-1, 3, 4)
@@ -334,16 +332,15 @@ def _read_numbers(
     columns = max(forms, key=lambda form: counts[form])
     lines, rows, numbers = [], [], []
     for row, (line, words) in enumerate(table):
-        odd = next((word for word in words if not is_number(word)), None)
+        values = list(map(number_or_nan, words))
+        odd = next((word for word, value in zip(words, values) if not math.isfinite(value)), None)
         if len(words) != columns:
-            bad.add(
-                line, _other_columns(len(words), columns if counts[columns] else forms[0], forms)
-            )
+            bad.add(line, f"{len(words)} columns; a KITTI row has 12, a TUM row 8")
         elif odd is not None:
-            hint = "; decimals are written with a point" if is_number(odd.replace(",", ".")) else ""
-            bad.add(line, f"not a number: {odd!r}{hint}")
+            hint = "; decimals are written with a point" if "," in odd else ""
+            bad.add(line, f"not a finite number: {odd!r}{hint}")
         else:
-            numbers.append([float(word) for word in words])
+            numbers.append(values)
             lines.append(line)
             rows.append(row)
     return np.array(lines, np.intp), np.array(rows, np.intp), np.array(numbers).reshape(-1, columns)
@@ -362,13 +359,6 @@ def _words(line: str) -> list[str]:
     stamp = in_seconds(words[0])
     is_euroc = separators and stamp != words[0]
     return [stamp, *words[1:4], *words[5:8], words[4]] if is_euroc else [stamp, *words[1:]]
-
-
-def _other_columns(count: int, wanted: int, forms: tuple[int, ...]) -> str:
-    if len(forms) > len(_COLUMNS["kitti"]) and wanted == forms[0]:
-        return f"{count} columns; a KITTI row has 12, a TUM row 8"
-    other = {12: "; this looks like a KITTI row", 8: "; this looks like a TUM row"}.get(count, "")
-    return f"{count} columns where {'KITTI' if wanted in _COLUMNS['kitti'] else 'TUM'} has {wanted}{other}"
 
 
 def _row(values: FloatArray) -> str:

@@ -47,6 +47,7 @@ DEFAULT_FPS = 10.0
 AUTO = Path("auto")
 _STATED_FX_SIGMA = 0.1  # relative, by a field of view that the user states
 _ORB_COEFFICIENT = re.compile(r"Camera1?\.[kp]\d")
+_TABLE = ".txt"  # of COLMAP, which has no keys that tell the program
 _FOV_LIMITS_DEG = (3.0, 150.0)
 
 _OF_THE_MOUNTING = ("camera_height_m", "readout_ms", "mask")  # which no calibration knows
@@ -68,17 +69,18 @@ _ORB_COEFFICIENTS = {
     "opencv": ("k1", "k2", "p1", "p2", "k3"),
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
-# COLMAP: places of fx, fy, cx, cy among the parameters, those of k1 k2 p1 p2 k3 ... (-1: zero), and the model
-_COLMAP: dict[str, tuple[tuple[int, ...], tuple[int, ...], str]] = {
-    "SIMPLE_PINHOLE": ((0, 0, 1, 2), (), "pinhole"),
-    "PINHOLE": ((0, 1, 2, 3), (), "pinhole"),
-    "SIMPLE_RADIAL": ((0, 0, 1, 2), (3, -1, -1, -1), "opencv"),
-    "RADIAL": ((0, 0, 1, 2), (3, 4, -1, -1), "opencv"),
-    "OPENCV": ((0, 1, 2, 3), (4, 5, 6, 7), "opencv"),
-    "OPENCV_FISHEYE": ((0, 1, 2, 3), (4, 5, 6, 7), "fisheye"),
-    "FULL_OPENCV": ((0, 1, 2, 3), (4, 5, 6, 7, 8, 9, 10, 11), "opencv"),
+# COLMAP: how many focal lengths, and after the principal point how many of k1 k2 p1 p2 k3 ...
+_COLMAP = {
+    "SIMPLE_PINHOLE": (1, 0),
+    "PINHOLE": (2, 0),
+    "SIMPLE_RADIAL": (1, 1),
+    "RADIAL": (1, 2),
+    "OPENCV": (2, 4),
+    "OPENCV_FISHEYE": (2, 4),
+    "FULL_OPENCV": (2, 8),
 }
 _VINS_COEFFICIENTS = ("k1", "k2", "p1", "p2")
+_LEAST_COEFFICIENTS = 4  # of OpenCV's lens
 _NAMELESS = (4, 5, 8)  # coefficients of OpenCV, which files without a name of the lens mean
 _ZOOM_STEP = 1.02
 _ZOOM_LIMITS = (0.2, 8.0)
@@ -199,25 +201,20 @@ def _read_foreign(path: Path, fps: float) -> CameraFile | None:
     ``fps`` is for files without a rate. ``DataError``: a number is missing or wrong, or the lens is unknown.
     """
     try:
-        content = read_text(path) if path.suffix == ".txt" else read_opencv_yaml(path)
+        is_table = path.suffix == _TABLE
+        content = {_TABLE: read_text(path)} if is_table else read_opencv_yaml(path)
     except (OSError, UnicodeDecodeError, ErfsfmError):
         return None  # for the reader of camera.yaml to say what is wrong
-    program = "COLMAP"
-    keys_of: Callable[[Any], Keys] = _colmap
-    if path.suffix != ".txt":
-        mark = next(
-            (mark for mark in _PROGRAMS if isinstance(content, dict) and mark in content), None
-        )
-        if mark is None:
-            return None
-        program, keys_of = _PROGRAMS[mark]
+    mark = next((mark for mark in _PROGRAMS if isinstance(content, dict) and mark in content), None)
+    if mark is None:
+        return None
+    program, keys_of = _PROGRAMS[mark]
     try:
         keys = keys_of(content)
-        if not any(keys["distortion"]) and keys["model"] == "opencv":
-            keys["model"] = "pinhole"
-        if keys["model"] == "pinhole":
-            keys["distortion"] = []
-        return camera_of({"fps": fps, **keys, "source": f"a calibration of {program}"}, str(path))
+        keys |= {"fps": keys.get("fps") or fps, "source": f"a calibration of {program}"}
+        if keys["model"] != "fisheye" and not any(keys["distortion"]):
+            keys |= {"model": "pinhole", "distortion": []}
+        return camera_of(keys, str(path))
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise DataError(
             f"{path} looks like a calibration of {program}, but lacks {error}"
@@ -262,14 +259,14 @@ def pinhole_keys(width: Any, height: Any, fx: Any, fy: Any, cx: Any, cy: Any, **
 
 def _kalibr(camera: Keys) -> Keys:
     """Of Kalibr's ``cam0`` or EuRoC's ``sensor.yaml``."""
-    if camera.get("camera_model", "pinhole") != "pinhole":
-        raise DataError(
-            f"the camera_model {camera['camera_model']} is unknown: calibrate as pinhole"
-        )
+    _require_pinhole(camera, "camera_model")
     distortion = camera.get("distortion_coeffs") or camera.get("distortion_coefficients") or []
-    keys = pinhole_keys(*camera["resolution"], *camera["intrinsics"], distortion=distortion)
-    rate = {"fps": camera["rate_hz"]} if "rate_hz" in camera else {}
-    return {**keys, **rate, "model": lens_model(camera.get("distortion_model"), distortion)}
+    lens = {
+        "distortion": distortion,
+        "model": lens_model(camera.get("distortion_model"), distortion),
+    }
+    pinhole = *camera["resolution"], *camera["intrinsics"]
+    return pinhole_keys(*pinhole, fps=camera.get("rate_hz"), **lens)
 
 
 def _camera_info(content: Keys) -> Keys:
@@ -286,34 +283,36 @@ def _orb_slam(content: Keys) -> Keys:
     model = lens_model(content.get("Camera.type", "PinHole"), ())
     names = _ORB_COEFFICIENTS[model]
     keys = pinhole_keys(content["Camera.width"], content["Camera.height"], *focal)
-    keys |= {"fps": content["Camera.fps"]} if "Camera.fps" in content else {}
-    known = [f"{prefix}.{name}" for name in names]
-    unused = [
-        key
-        for key in content
-        if _ORB_COEFFICIENT.fullmatch(key) and content[key] and key not in known
-    ]
-    if unused:
-        raise DataError(f"{', '.join(unused)} of a {model} lens cannot be used: give a camera.yaml")
-    return {**keys, "model": model, "distortion": [content.get(name, 0.0) for name in known]}
+    lens = {key: content[key] for key in content if _ORB_COEFFICIENT.fullmatch(key)}
+    distortion = _coefficients(lens, [f"{prefix}.{name}" for name in names], f"a {model} lens")
+    return {**keys, "fps": content.get("Camera.fps"), "model": model, "distortion": distortion}
 
 
 def _vins(content: Keys) -> Keys:
-    if content.get("model_type") != "PINHOLE":
-        raise DataError(
-            f"the model_type {content.get('model_type')} is unknown: calibrate as PINHOLE"
-        )
-    pinhole, lens = content["projection_parameters"], content["distortion_parameters"]
+    _require_pinhole(content, "model_type")
+    pinhole = content["projection_parameters"]
     focal = (pinhole[name] for name in ("fx", "fy", "cx", "cy"))
     keys = pinhole_keys(content["image_width"], content["image_height"], *focal)
-    if unused := [name for name in lens if lens[name] and name not in _VINS_COEFFICIENTS]:
-        raise DataError(f"{', '.join(unused)} of VINS cannot be used: give a camera.yaml")
-    return {**keys, "model": "opencv", "distortion": [lens[n] for n in _VINS_COEFFICIENTS]}
+    distortion = _coefficients(content["distortion_parameters"], _VINS_COEFFICIENTS, "VINS")
+    return {**keys, "model": "opencv", "distortion": distortion}
 
 
-def _colmap(text: str) -> Keys:
+def _require_pinhole(content: Keys, key: str) -> None:
+    if str(content.get(key, "pinhole")).lower() != "pinhole":
+        raise DataError(f"the {key} {content[key]} is unknown: calibrate as pinhole")
+
+
+def _coefficients(lens: Keys, names: Sequence[str], whose: str) -> list[float]:
+    """Those of a lens that are named, in this order; ``DataError`` where others are not zero."""
+    if unused := [name for name, value in lens.items() if value and name not in names]:
+        raise DataError(f"{', '.join(unused)} of {whose} cannot be used: give a camera.yaml")
+    return [lens.get(name, 0.0) for name in names]
+
+
+def _colmap(content: Keys) -> Keys:
     """Of the first row; COLMAP's (0.5, 0.5) is the centre of the first pixel."""
-    rows = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    lines = content[_TABLE].splitlines()
+    rows = [line.split() for line in lines if line.strip() and not line.startswith("#")]
     try:
         _, name, width, height, *words = rows[0]
         if name not in _COLMAP:
@@ -321,20 +320,21 @@ def _colmap(text: str) -> Keys:
                 f"COLMAP's camera model {name} is unknown: known are {', '.join(_COLMAP)}; fx fy cx cy alone, as of "
                 "DROID-SLAM, lack the size of images: give a camera.yaml"
             )
-        places, coefficients, model = _COLMAP[name]
-        if len(words) != 1 + max(places + coefficients):
+        focal, count = _COLMAP[name]
+        fx, *values = map(float, words)
+        fy, cx, cy, *distortion = values if focal == 2 else [fx, *values]
+        if len(distortion) != count:
             raise ValueError(f"{name} has other parameters")
-        values = [*map(float, words), 0.0]
-        fx, fy, cx, cy = (values[place] for place in places)
-        distortion = [values[place] for place in coefficients]
-        return pinhole_keys(
-            int(width), int(height), fx, fy, cx - 0.5, cy - 0.5, model=model, distortion=distortion
-        )
+        distortion += [0.0] * (_LEAST_COEFFICIENTS - count)
+        model = "fisheye" if "FISHEYE" in name else "opencv"
+        size = int(width), int(height)
+        return pinhole_keys(*size, fx, fy, cx - 0.5, cy - 0.5, model=model, distortion=distortion)
     except (IndexError, ValueError) as error:
         raise ValueError("a row 'CAMERA_ID MODEL WIDTH HEIGHT PARAMS...'") from error
 
 
 _PROGRAMS: dict[str, tuple[str, Callable[[Keys], Keys]]] = {
+    _TABLE: ("COLMAP", _colmap),
     "cam0": ("Kalibr", lambda content: _kalibr(content["cam0"])),
     "T_BS": ("EuRoC", _kalibr),
     "camera_matrix": ("ROS", _camera_info),
@@ -357,7 +357,7 @@ class Undistortion:
         self._K = pinhole.K
         self._coefficients = np.asarray(camera.distortion, dtype=np.float64)
         self._model = camera.model
-        zoom = self._shortest_zoom(camera.width, camera.height)
+        zoom = self._shortest_zoom(pinhole.pixel_grid())
         if zoom > _FOLDED_ZOOM:
             raise SequenceError(f"distortion {list(camera.distortion)} folds the image: {_CHECK}")
         if zoom > _UNLIKELY_ZOOM:
@@ -367,12 +367,8 @@ class Undistortion:
             pinhole, fx=zoom * camera.fx, fy=zoom * camera.fy, undistorted=True
         )
         pixels = self.intrinsics.pixel_grid()
-        seen = (
-            self.distort(pixels.reshape(-1, 2), self.intrinsics.K)
-            .astype(np.float32)
-            .reshape(pixels.shape)
-        )
-        self._maps = np.ascontiguousarray(seen[..., 0]), np.ascontiguousarray(seen[..., 1])
+        seen = self.distort(pixels.reshape(-1, 2), self.intrinsics.K).astype(np.float32)
+        self._maps = cv2.split(seen.reshape(pixels.shape))
 
     def apply(self, image: Image) -> Image:
         """Undistort an image ``(H, W, 3)``.
@@ -421,12 +417,10 @@ class Undistortion:
         bent = np.arctan(2 * radius * np.tan(angle / 2)) / angle
         return rays * bent / np.maximum(radius, 1e-12)
 
-    def _shortest_zoom(self, width: int, height: int) -> float:
-        """Zoom out from the centre until the border of the pinhole image meets that of the lens's image."""
-        corner = np.array([width - 1.0, height - 1.0])
-        v, u = np.mgrid[:height, :width].reshape(2, -1).astype(np.float64)
-        at_edge = (u == 0) | (u == width - 1) | (v == 0) | (v == height - 1)
-        border = np.column_stack([u, v])[at_edge]
+    def _shortest_zoom(self, pixels: FloatArray) -> float:
+        """Zoom out from the centre until the border of the pixels ``(H, W, 2)`` meets that of the lens's image."""
+        border, corner = pixels[[0, -1]].reshape(-1, 2), pixels[-1, -1]
+        border = np.concatenate([border, pixels[:, [0, -1]].reshape(-1, 2)])
         zoom, radius = _ZOOM_LIMITS[1], np.zeros(len(border))
         fits = False
         while zoom > _ZOOM_LIMITS[0]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -36,7 +37,6 @@ _EARTH_RADIUS_M = 6.371e6
 FASTEST_M_S = 300.0
 _LEAST_FIXES = 3  # one step may be an error of one fix
 _MOST = np.array([90.0, 180.0, 1e5])
-_NO_FIX = [math.nan] * 6
 
 
 def read_gps(path: Path) -> GpsTrack:
@@ -102,41 +102,37 @@ def _fixes(lines: list[str], path: Path) -> list[tuple[int, list[float]]]:
     """
     delimiter = max(",;\t", key=lines[0].count) if lines else ","
     reader = csv.DictReader(lines, skipinitialspace=True, delimiter=delimiter)
-    places = {}
-    for column, spellings in _COLUMNS.items():
-        named = [name for name in reader.fieldnames or () if name.strip().lower() in spellings]
-        places[column] = next(iter(named), "")
-    missing = [name for name in _NEEDED if not places[name]]
+    names: dict[str, str] = {}
+    unit = math.nan
+    for name in reader.fieldnames or ():
+        for column, spellings in _COLUMNS.items():
+            if name.strip().lower() in spellings:
+                names.setdefault(column, name)
+        letters = re.sub("[^a-z]", "", name.lower())
+        if letters in _SPEED_UNITS and "speed" not in names:
+            names["speed"], unit = name, _SPEED_UNITS[letters]
+    missing = [name for name in _NEEDED if name not in names]
     if missing:
         raise SequenceError(
             f"{path} lacks {', '.join(missing)}: its first row must name {', '.join(_NEEDED)}"
         )
-    units = {
-        name: _SPEED_UNITS.get(re.sub("[^a-z]", "", name.lower()))
-        for name in reader.fieldnames or ()
-    }
-    speed, unit = next(((name, unit) for name, unit in units.items() if unit), ("", math.nan))
     rows = []
     for row in reader:
-        try:
-            numbers = [
-                _seconds(row[places["stamp"]]),
-                float(row[places["latitude"]]),
-                float(row[places["longitude"]]),
-                float(row[places["altitude"]]) if places["altitude"] else math.nan,
-                float(row.get(places["hdop"]) or 1.0),
-                unit * number_or_nan(row.get(speed) or ""),
-            ]
-        except (TypeError, ValueError):
-            numbers = _NO_FIX
-        rows.append((reader.line_num, numbers))
+        words = {column: row[name] or "" for column, name in names.items()}
+        places = [
+            number_or_nan(words.get(name, "")) for name in ("latitude", "longitude", "altitude")
+        ]
+        dilution = number_or_nan(words.get("hdop") or "1")
+        speed = unit * number_or_nan(words.get("speed", ""))
+        rows.append((reader.line_num, [_seconds(words["stamp"]), *places, dilution, speed]))
     return rows
 
 
 def _seconds(word: str) -> float:
-    """A stamp as seconds; those of a date in UTC since 1970; ``ValueError`` where it is neither."""
+    """A stamp as seconds; those of a date in UTC since 1970; NaN where it is neither."""
     seconds = number_or_nan(in_seconds(word))
-    if not math.isnan(seconds):
-        return seconds
-    moment = datetime.fromisoformat(word.strip())
-    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+    with suppress(ValueError):
+        if math.isnan(seconds):
+            moment = datetime.fromisoformat(word.strip())
+            seconds = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+    return seconds

@@ -62,9 +62,10 @@ def _open_odometry(root: OdometryRoot, name: str, asked: Path | None) -> Recorde
     T_camera_cam0 = calibration.T_camera_cam0(f"P{number}")
     simulated = root.simulation_seed()
     key = next((key for key in ("Tr", "Tr_velo_to_cam") if key in calibration), None)
-    T_cam0_lidar = (
-        None if key is None else np.vstack([calibration.matrix(key, (3, 4)), [0.0, 0.0, 0.0, 1.0]])
-    )
+    T_camera_lidar = None
+    if key is not None:
+        T_cam0_lidar = np.vstack([calibration.matrix(key, (3, 4)), [0.0, 0.0, 0.0, 1.0]])
+        T_camera_lidar = T_camera_cam0 @ T_cam0_lidar
     return RecordedSequence(
         name=name,
         images=stored,
@@ -77,9 +78,9 @@ def _open_odometry(root: OdometryRoot, name: str, asked: Path | None) -> Recorde
             root.base / "poses" / f"{name}.txt", files, stamps, T_camera_cam0
         ),
         usual_height_m=kitti.CAMERA_HEIGHT_M if simulated is None or asked is not None else None,
-        T_camera_lidar=None if T_cam0_lidar is None else T_camera_cam0 @ T_cam0_lidar,
-        scans=_readers(kitti.read_velodyne, folder / "velodyne", "*.bin", files),
-        depth_maps=_readers(read_depth_map, folder / f"depth_{number}", "*.png", files),
+        T_camera_lidar=T_camera_lidar,
+        scans=_readers(kitti.read_velodyne, folder / "velodyne", files),
+        depth_maps=_readers(read_depth_map, folder / f"depth_{number}", files),
         distance_to_surface=_distance_to_mesh(root.base / "mesh.ply"),
     )
 
@@ -110,10 +111,8 @@ def _open_raw(drive: Path, asked: Path | None) -> RecordedSequence:
         T_any_camera=_oxts_poses(drive, files, stamps, known, T_camera_lidar),
         usual_height_m=kitti.CAMERA_HEIGHT_M,
         T_camera_lidar=T_camera_lidar,
-        scans=_readers(kitti.read_velodyne, drive / "velodyne_points/data", "*.bin", files),
-        depth_maps=_readers(
-            read_depth_map, drive / _DEPTH_MAPS / f"image_{number}", "*.png", files
-        ),
+        scans=_readers(kitti.read_velodyne, drive / "velodyne_points/data", files),
+        depth_maps=_readers(read_depth_map, drive / _DEPTH_MAPS / f"image_{number}", files),
     )
 
 
@@ -198,25 +197,19 @@ def _oxts_poses(
     if not path.exists():
         logger.warning("no %s: the drive has no reference poses", path)
         return None
-    found = sorted(folder.glob("*.txt"))
-    packets = by_number(found) if found else None
-    paths = {int(path.stem): path for path in found}
-    rows = (
-        range(len(files))
-        if all(files.first + row in paths for row in range(len(files)))
-        else files.rows
-    )
-    if packets is None or not all(files.first + row in paths for row in rows):
+    packets = _readers(kitti.read_packet, folder, files)
+    if not packets.keys() >= set(files.rows):
         raise SequenceError(
-            f"{folder} has {len(paths)} packets for {len(files.paths)} images: restore what is missing, or remove "
+            f"{folder} has {len(packets)} packets for {len(files.paths)} images: restore what is missing, or remove "
             f"oxts to run without a reference"
         )
-    known = np.array(rows)
+    known = np.array([row for row in range(len(files)) if row in packets])
     ages_s = np.zeros(len(known))
-    packet_times = _dates(drive / "oxts" / "timestamps.txt", packets)
+    numbered = by_number(sorted(folder.glob("*.txt")))
+    packet_times = _dates(drive / "oxts" / "timestamps.txt", numbered)
     if image_times is not None and packet_times is not None:
-        ages_s = image_times[known] - packet_times[known + files.first - packets.first]
-    content = np.array([kitti.read_packet(paths[files.first + row]) for row in rows])
+        ages_s = image_times[known] - packet_times[known + files.first - numbered.first]
+    content = np.array([packets[row]() for row in known.tolist()])
     T_camera_imu = T_camera_lidar @ CalibrationFile(path).transform("R", "T")
     T_world_camera = T_world_imu(content, ages_s) @ se3.invert(T_camera_imu)
     if len(known) < len(files):
@@ -249,10 +242,10 @@ def T_world_imu(packets: FloatArray, ages_s: FloatArray) -> FloatArray:
 
 
 def _readers(
-    read: Callable[[Path], FloatArray], folder: Path, pattern: str, files: NumberedFiles
+    read: Callable[[Path], FloatArray], folder: Path, files: NumberedFiles
 ) -> dict[int, ArrayReader]:
     """Readers of the files of a folder by frame, by the numbers of the images."""
-    paths = (path for path in folder.glob(pattern) if path.stem.isdecimal())
+    paths = (path for path in folder.glob("*") if path.stem.isdecimal())
     return {int(path.stem) - files.first: partial(read, path) for path in paths}
 
 
@@ -276,21 +269,16 @@ def _distance_to_mesh(path: Path) -> Callable[[FloatArray], FloatArray] | None:
 
 def _find_odometry(path: Path, asked: Asked) -> dict[str, Opener]:
     """The sequences of a root, or the one whose own folder is given."""
-    root = kitti.find_odometry_root(path)
+    root, where = kitti.find_odometry_root(path), path.absolute()
     if root is not None:
         names = root.names()
-        if (
-            asked.name is not None
-            and asked.name not in names
-            and (root.sequences / asked.name).is_dir()
-        ):
+        if asked.name and asked.name not in names and (root.sequences / asked.name).is_dir():
             names.append(asked.name)  # for the error about what it lacks
-        return {name: partial(_open_odometry, root, name, asked.camera) for name in names}
-    where = path.absolute()
-    above = kitti.find_odometry_root(where.parent) if where.parent.name == "sequences" else None
-    if above is None or kitti.odometry_camera(path) is None:
+    elif where.parent.name == "sequences" and kitti.odometry_camera(path) is not None:
+        root, names = kitti.find_odometry_root(where.parent), [where.name]
+    if root is None:
         return {}
-    return {where.name: partial(_open_odometry, above, where.name, asked.camera)}
+    return {name: partial(_open_odometry, root, name, asked.camera) for name in names}
 
 
 def _find_raw(path: Path, asked: Asked) -> dict[str, Opener]:

@@ -332,25 +332,22 @@ def _scannet_camera(path: Path, files: NumberedFiles) -> CameraFile:
 def _open_nuscenes(root: Path, tables: Path, scene: str, asked: Path | None) -> RecordedSequence:
     """The front camera, key frames and sweeps; its height is that over the ego frame, which lies on the ground."""
     try:
-        rows, mounts, ego_poses = _scene(tables, scene)
+        rows = _scene(tables, scene)
         front, lidar = rows["CAM_FRONT"], rows.get("LIDAR_TOP", [])
         table = tables / "sample_data.json"
         files = by_table([root / row["filename"] for row in front], table)
         stamps = require_stamps(_times(front)[: files.first + len(files)], table, files)
         shown = front[files.first :][: len(files)]
-        mount = mounts[front[0]["calibrated_sensor_token"]]
-        (T_ego_camera,) = _nuscenes_poses([mount])
-        T_any_camera = (
-            _nuscenes_poses([ego_poses[row["ego_pose_token"]] for row in shown]) @ T_ego_camera
-        )
-        (fx, _, cx), (_, fy, cy), _ = mount["camera_intrinsic"]
+        (T_ego_camera,) = _nuscenes_poses([front[0]["mount"]])
+        T_any_camera = _nuscenes_poses([row["ego_pose"] for row in shown]) @ T_ego_camera
+        (fx, _, cx), (_, fy, cy), _ = front[0]["mount"]["camera_intrinsic"]
         height_m = float(T_ego_camera[2, 3])
         size = front[0]["width"], front[0]["height"]
         keys = pinhole_keys(*size, fx, fy, cx, cy, fps=_NUSCENES_FPS, camera_height_m=height_m)
         scans: dict[int, ArrayReader] = {}
         T_camera_lidar = None
         if lidar:
-            (T_ego_lidar,) = _nuscenes_poses([mounts[lidar[0]["calibrated_sensor_token"]]])
+            (T_ego_lidar,) = _nuscenes_poses([lidar[0]["mount"]])
             T_camera_lidar = se3.invert(T_ego_camera) @ T_ego_lidar
             for k, row in zip(*nearest_pairs(stamps, _times(lidar), _NEAR_S)):
                 path = root / lidar[row]["filename"]
@@ -365,19 +362,19 @@ def _open_nuscenes(root: Path, tables: Path, scene: str, asked: Path | None) -> 
     return _recorded("nuscenes", scene, files, stamps, asked, [root], own, files.first, **known)
 
 
-def _scene(tables: Path, scene: str) -> tuple[dict[str, list[Row]], dict[str, Row], dict[str, Row]]:
-    """The rows of each sensor of a scene in the order of time, the mounts of sensors, and the poses of the car."""
+def _scene(tables: Path, scene: str) -> dict[str, list[Row]]:
+    """The rows of each sensor of a scene in the order of time, with the ``mount`` of it and the ``ego_pose`` then."""
     (token,) = (row["token"] for row in _table(tables, "scene") if row["name"] == scene)
     samples = {row["token"] for row in _table(tables, "sample") if row["scene_token"] == token}
-    channels = {row["token"]: row["channel"] for row in _table(tables, "sensor")}
-    mounts = _by_token(_table(tables, "calibrated_sensor"))
+    names = "sensor", "calibrated_sensor", "ego_pose"
+    sensors, mounts, ego_poses = (_by_token(_table(tables, name)) for name in names)
     rows: dict[str, list[Row]] = {}
     for row in sorted(_table(tables, "sample_data"), key=lambda row: float(row["timestamp"])):
         if row["sample_token"] in samples:
-            rows.setdefault(
-                channels[mounts[row["calibrated_sensor_token"]]["sensor_token"]], []
-            ).append(row)
-    return rows, mounts, _by_token(_table(tables, "ego_pose"))
+            mount = mounts[row["calibrated_sensor_token"]]
+            row |= {"mount": mount, "ego_pose": ego_poses[row["ego_pose_token"]]}
+            rows.setdefault(sensors[mount["sensor_token"]]["channel"], []).append(row)
+    return rows
 
 
 def _by_token(rows: list[Row]) -> dict[str, Row]:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from erfsfm.common.files import read_text
-from slam.formats.trajectory import other_unit, read_trajectory
+from slam.formats.trajectory import nearest_stamps, other_unit, read_trajectory
 from slam.frames import runs
 from slam.geometry import se3
 from slam.geometry.se3 import BoolArray, FloatArray
@@ -77,9 +77,7 @@ def poses_near(
         T_near = se3.interpolate(
             np.concatenate([before[None], T_any_camera, after[None]]), reached, stamps
         )
-        place = np.clip(np.searchsorted(known, stamps, side="right") - 1, 0, len(known) - 2)
-        gap = np.minimum(np.abs(stamps - known[place]), np.abs(known[place + 1] - stamps))
-        T_near[gap > reach_s] = np.nan
+        T_near[np.abs(known[nearest_stamps(stamps, known)] - stamps) > reach_s] = np.nan
     are_known = known_poses(T_near)
     if not are_known.all():
         longest = max(

@@ -142,13 +142,12 @@ class RecordedSequence:
         part.start, part.stamps = self.start + start, self.stamps[start:stop]
         part.sources = tuple(source.shifted(start) for source in self.sources)
         part.T_any_camera = None if self.T_any_camera is None else self.T_any_camera[start:stop]
-        part.reference = self.true_poses(start, stop)
+        part.reference = _reference(part.T_any_camera)
         return part
 
     def take_truth(self, T_any_camera: FloatArray | None) -> None:
         """Let these be the true poses; a warning where no camera can follow them, such as millimetres, or a jump."""
-        self.T_any_camera, self.reference = T_any_camera, None
-        self.reference = self.true_poses(0, len(self))
+        self.T_any_camera, self.reference = T_any_camera, _reference(T_any_camera)
         if self.reference is None:
             return
         speeds = np.linalg.norm(np.diff(self.reference[:, :3, 3], axis=0), axis=1) / np.diff(
@@ -197,13 +196,6 @@ class RecordedSequence:
         with sequence_errors():
             return self.scans[self.start + index]()
 
-    def true_poses(self, start: int, stop: int) -> FloatArray | None:
-        """``T_world_camera`` of the frames [start, stop), their first the world; None unless all are known."""
-        poses = self.T_any_camera if self.reference is None else self.reference
-        if poses is None or not known_poses(poses[start:stop]).all():
-            return None
-        return rebased(poses[start:stop])
-
     def true_depth_frames(self) -> list[int]:
         """Frames with a depth map beside their image."""
         return [k for k in range(len(self)) if self.start + k in self.depth_maps]
@@ -232,20 +224,24 @@ class GrowingSequence(RecordedSequence):
         super().__init__(name, images, intrinsics, np.zeros(0), (), usual_height_m=camera_height_m)
 
 
+def _reference(T_any_camera: FloatArray | None) -> FloatArray | None:
+    """The poses with the first as the world; None unless all are known."""
+    if T_any_camera is None or not known_poses(T_any_camera).all():
+        return None
+    return rebased(T_any_camera)
+
+
 def _require_plausible_rate(name: str, stamps: FloatArray) -> None:
     """Refuse stamps that cannot be seconds, such as nanoseconds, and warn of unlikely ones and of long pauses."""
     if len(stamps) < 2:
         return
     periods = np.diff(stamps)
     period, longest = median(periods), float(periods.max())
+    doubt = f"{name}: its frames are {period:g} s apart: check its stamps, or fps, and their unit"
     if not POSSIBLE_PERIODS_S[0] <= period <= POSSIBLE_PERIODS_S[1]:
-        raise SequenceError(
-            f"{name}: its frames are {period:g} s apart: check its stamps, or fps, and their unit"
-        )
+        raise SequenceError(doubt)
     if not _USUAL_PERIODS_S[0] <= period <= _USUAL_PERIODS_S[1]:
-        logger.warning(
-            "%s: its frames are %g s apart: check its stamps, or fps, and their unit", name, period
-        )
+        logger.warning(doubt)
     if longest > max(_LONG_PAUSE_S, _LONG_PAUSE_PERIODS * period):
         logger.warning(
             "%s: its stamps pause for %g s before frame %d",
@@ -269,13 +265,12 @@ def frame_range(text: str, frames: int) -> tuple[int, int]:
     """
     try:
         begin, end = text.split(":")
-        start, stop = int(begin) if begin.strip() else 0, int(end) if end.strip() else frames
+        start, stop = int(begin.strip() or 0), int(end.strip() or frames)
     except ValueError:
         raise SequenceError(
             f"--frames {text!r} is not a range: write A:B, such as 0:300 or 100:"
         ) from None
-    first = start + frames if start < 0 else start
-    last = stop + frames if stop < 0 else stop
+    first, last = (end + frames if end < 0 else end for end in (start, stop))
     if not (0 <= first < frames and 0 <= last <= frames):
         raise SequenceError(
             f"--frames {text} reaches outside the sequence: it has {frames} frames; choose within 0:{frames}"

@@ -166,18 +166,6 @@ def _from_root(mounts: Mounts, frame: str) -> tuple[str, FloatArray]:
     return frame, T_root_frame
 
 
-def moving_frames(bag: Bag) -> dict[tuple[str, str], tuple[FloatArray, FloatArray]]:
-    """Stamps ``(M,)`` and ``T_parent_child`` ``(M, 4, 4)`` of the frames of ``/tf``, by parent and child."""
-    found: dict[tuple[str, str], dict[float, FloatArray]] = {}
-    for parent, child, stamp, T_parent_child in transforms(bag, _MOVING_TOPIC):
-        found.setdefault((parent, child), {}).setdefault(stamp, T_parent_child)
-    moving = {}
-    for frames, poses in found.items():
-        stamps = sorted(poses)
-        moving[frames] = np.array(stamps), np.stack([poses[stamp] for stamp in stamps])
-    return moving
-
-
 def transforms(bag: Bag, topic: str) -> Iterator[tuple[str, str, float, FloatArray]]:
     """Parent, child, stamp in seconds and ``T_parent_child`` ``(4, 4)`` of the good transforms of a topic of tf."""
     for message in bag.messages(topic) if topic in bag.types else ():
@@ -295,9 +283,14 @@ def _true_poses(bag: Bag, mounts: Mounts, camera: str, stamps: FloatArray) -> Fl
                 )
             known, T_any_body = _poses(StampedMessages(bag, topic))
             return poses_near(T_any_body @ T_body_camera, known, stamps, bag.path)
-    for (parent, body), (known, T_any_body) in moving_frames(bag).items():
+    moving: dict[tuple[str, str], dict[float, FloatArray]] = {}
+    for parent, body, stamp, T_parent_body in transforms(bag, _MOVING_TOPIC):
+        moving.setdefault((parent, body), {}).setdefault(stamp, T_parent_body)
+    for (parent, body), poses in moving.items():
         T_body_camera = transform_between(mounts, body, camera)
         if T_body_camera is not None and any(map(_TRUTH.search, (parent, body))):
+            known = np.sort(list(poses))
+            T_any_body = np.stack([poses[stamp] for stamp in known.tolist()])
             return poses_near(T_any_body @ T_body_camera, known, stamps, bag.path)
         unused[f"{parent} to {body} in {_MOVING_TOPIC}"] = (
             "is not named as truth, or not joined to the camera"

@@ -73,8 +73,8 @@ def test_tum_round_trip_keeps_every_digit_of_a_stamp(tmp_path: Path, format: str
     [
         ("", "auto", "no row"),
         ("1 2 3\n", "auto", "line 1: 3 columns; a KITTI row has 12, a TUM row 8"),
-        (TUM, "kitti", "line 1: 8 columns where KITTI has 12; this looks like a TUM row"),
-        (KITTI, "tum", "line 1: 12 columns where TUM has 8; this looks like a KITTI row"),
+        (TUM, "kitti", "line 1: 8 columns; a KITTI row has 12, a TUM row 8"),
+        (KITTI, "tum", "line 1: 12 columns; a KITTI row has 12, a TUM row 8"),
         ("1 0 0 0 0 1 0 0 0 0 -1 0", "auto", "line 1: the 3x3 part is not a rotation"),
         (
             "1e200 1e200 0 0 -1e200 1e200 0 0 0 0 1 0",
@@ -85,7 +85,7 @@ def test_tum_round_trip_keeps_every_digit_of_a_stamp(tmp_path: Path, format: str
         (
             TUM.replace(".", ","),
             "auto",
-            "line 1: not a number: '0,1'; decimals are written with a point",
+            "line 1: not a finite number: '0,1'; decimals are written with a point",
         ),
         (f"{TUM}\n{TUM}\n", "auto", "line 2: time stamps must increase"),
         (

@@ -240,8 +240,9 @@ def camera_file_of(
         raise SequenceError(
             f"{where} has no calibration, its focal length is {fx:g}: give --camera"
         )
-    width = info.width or (size or (0, 0))[0]
-    height = info.height or (size or (0, 0))[1]
+    width, height = info.width, info.height
+    if size is not None and not (width and height):
+        width, height = size
     roi = info.roi
     if size != (width, height):
         binning_x, binning_y = max(info.binning_x, 1), max(info.binning_y, 1)

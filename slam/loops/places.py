@@ -77,7 +77,7 @@ class Places:
         # Damaged bytes raise almost anything in zipfile, zlib, tokenize and NumPy: no list of types
         # is complete.
         except Exception as error:
-            reason = " ".join([f"{type(error).__name__}:", *str(error).split()])[:120]
+            reason = f"{type(error).__name__}: {error}"
             raise RunError(f"{path} is damaged ({reason}): run the sequence again") from error
         if version != _FORMAT:
             raise RunError(f"{path} has format {version}, this version reads {_FORMAT}: run again")
@@ -170,7 +170,8 @@ class PlaceStructure:
             if other != row:
                 point, corner = matches(places[row], places[other], self._thresholds)
             sightings.append([np.full(len(corner), other), corner, point])
-        return self._triangulated(*np.concatenate(sightings, axis=1), len(places[row]))
+        views, corners, points = np.concatenate(sightings, axis=1)
+        return self._triangulated(views, corners, points, len(places[row]))
 
     def _triangulated(self, views: Rows, corners: Rows, point: Rows, count: int) -> Tracks:
         """Points ``(count, 3)``, NaN where unknown, and the sightings that agree with them.

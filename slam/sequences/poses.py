@@ -173,9 +173,6 @@ def read_truth(path: Path, stamps: FloatArray) -> FloatArray:
 
 def poses_beside(recording: Path) -> Path | None:
     """A file ``poses*.txt`` in or beside a recording; nothing tells whose poses they are."""
-    places = (
-        (recording, recording.absolute().parent)
-        if recording.is_dir()
-        else (recording.absolute().parent,)
-    )
-    return next((path for place in places for path in sorted(place.glob("poses*.txt"))), None)
+    place = recording.absolute()
+    found = [*sorted(place.glob("poses*.txt")), *sorted(place.parent.glob("poses*.txt"))]
+    return next(iter(found), None)

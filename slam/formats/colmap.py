@@ -76,13 +76,8 @@ def write_colmap(
     """
     of_frames = {k: rows for k, rows in sightings.of_frames().items() if k not in without_image}
     width, height = intrinsics.width, intrinsics.height
-    fx, fy, cx, cy = (
-        intrinsics.fx,
-        intrinsics.fy,
-        intrinsics.cx + _HALF_PIXEL,
-        intrinsics.cy + _HALF_PIXEL,
-    )
-    pinhole = [float(value) for value in (fx, fy, cx, cy)]
+    centre = intrinsics.cx + _HALF_PIXEL, intrinsics.cy + _HALF_PIXEL
+    pinhole = [float(value) for value in (intrinsics.fx, intrinsics.fy, *centre)]
     camera = [f"1 PINHOLE {width} {height} {' '.join(map(repr, pinhole))}"]
     packed_camera = [struct.pack("<IiQQ4d", 1, _PINHOLE, width, height, *pinhole)]
     images, packed_images = _images(T_world_camera, without_image, sightings, of_frames)

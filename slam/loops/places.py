@@ -164,17 +164,14 @@ class PlaceStructure:
     def _triangulated_around(self, row: int) -> Tracks:
         """A point for each corner of a place, by the places around it."""
         places = self._places.views
-        views, corners, points = [], [], []
+        sightings = []
         for other in range(max(0, row - _NEIGHBOURS), min(len(places), row + _NEIGHBOURS + 1)):
             point = corner = np.arange(len(places[row]))
             if other != row:
                 point, corner = matches(places[row], places[other], self._thresholds)
-            views.append(np.full(len(corner), other))
-            corners.append(corner)
-            points.append(point)
-        return self._triangulated(
-            np.concatenate(views), np.concatenate(corners), np.concatenate(points), len(places[row])
-        )
+            sightings.append([np.full(len(corner), other), corner, point])
+        views, corners, points = np.concatenate(sightings, axis=1)
+        return self._triangulated(views, corners, points, len(places[row]))
 
     def _triangulated(self, views: Rows, corners: Rows, point: Rows, count: int) -> Tracks:
         """Points ``(count, 3)``, NaN where unknown, and the sightings that agree with them.

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from scipy.sparse.linalg import norm
 
 from slam.frames import Descriptors, View
 from slam.geometry.se3 import FloatArray
@@ -93,6 +94,6 @@ def _weighted(counts: csr_array, inverse_frequency: FloatArray) -> csr_array:
     """Unit tf-idf vectors, of the square roots of the counts: repeated structure counts less (Jegou et al. 2009)."""
     weights = counts.copy()
     weights.data = np.sqrt(counts.data) * inverse_frequency[counts.indices]
-    norm = np.sqrt(np.asarray((weights * weights).sum(axis=1)).ravel())
-    weights.data = weights.data / np.repeat(np.maximum(norm, 1e-12), np.diff(weights.indptr))
+    lengths = np.maximum(norm(weights, axis=1), 1e-12)
+    weights.data = weights.data / np.repeat(lengths, np.diff(weights.indptr))
     return weights

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.common.errors import DataError, one_line
+from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import CameraFile, camera_of
 from erfsfm.common.readers.images import Stretch, decode_image, decode_values
 from slam.frames import Image
@@ -129,7 +129,7 @@ class Bag:
         except SequenceError:
             raise
         except Exception as error:  # of whatever kind a damaged file raises inside rosbags
-            reason = one_line(f"{type(error).__name__}: {error}")
+            reason = f"{type(error).__name__}: {error}"
             raise SequenceError(
                 f"bag {self.path} cannot be read ({reason}): copy it again, reindex it, or convert it to a bag of ROS 2"
             ) from error
@@ -234,14 +234,14 @@ def camera_file_of(
         model = lens_model(info.distortion_model if any(used) else None, used)
     except DataError as error:
         raise SequenceError(f"{where}: {error}") from error
-    fx, _, cx, *_ = P if rectified else K
-    fy, cy = (P[5], P[6]) if rectified else (K[4], K[5])
+    (fx, _, cx, *_), (_, fy, cy, *_), _ = np.reshape(P if rectified else K, (3, -1)).tolist()
     if not (fx > 0 and fy > 0):
         raise SequenceError(
             f"{where} has no calibration, its focal length is {fx:g}: give --camera"
         )
-    width = info.width or (size or (0, 0))[0]
-    height = info.height or (size or (0, 0))[1]
+    width, height = info.width, info.height
+    if size is not None and not (width and height):
+        width, height = size
     roi = info.roi
     if size != (width, height):
         binning_x, binning_y = max(info.binning_x, 1), max(info.binning_y, 1)

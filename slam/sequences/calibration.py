@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import re
 from dataclasses import dataclass
+from itertools import compress
 from typing import Any, Literal
 
 import cv2
@@ -276,12 +277,7 @@ def fit_camera(views: list[View], width: int, height: int, model: Model) -> Cali
     fit = _fit(views, width, height, model)
     good = fit.errors_px <= _OUTLIER * np.median(fit.errors_px)
     if not good.all():
-        fit = _fit(
-            [view for view, is_good in zip(views, good, strict=True) if is_good],
-            width,
-            height,
-            model,
-        )
+        fit = _fit(list(compress(views, good)), width, height, model)
     advice = "tilt it by 20 to 45 degrees about both axes, near and far, also at the borders of the image"
     steepest, most_error = float(fit.tilts_deg.max()), _MOST_ERROR_PX * max(fit.width / 640, 1.0)
     faults = {

@@ -120,11 +120,8 @@ def open_video(path: Path, asked: Path | None) -> RecordedSequence:
     camera = find_camera_file(
         asked, folder, wanted_by=f"video {path}", images=frames, fps=frames.fps
     )
-    stamps, sources = (
-        _times_of_frames(path, frames, camera.fps),
-        (Source(f"folder/{video_name(path)}"),),
-    )
-    return RecordedSequence(clip_name(path), frames, camera, stamps, sources)
+    stamps, source = _times_of_frames(path, frames, camera.fps), f"folder/{video_name(path)}"
+    return RecordedSequence(clip_name(path), frames, camera, stamps, (Source(source),))
 
 
 def _times_of_frames(path: Path, frames: VideoFrames, fps: float) -> FloatArray:

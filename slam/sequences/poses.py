@@ -41,10 +41,9 @@ def poses_of(positions: FloatArray, quaternions_xyzw: FloatArray) -> FloatArray:
         raise ValueError(f"a position is not finite, or farther than {_FARTHEST:g}")
     with np.errstate(over="ignore"):
         lengths = np.linalg.norm(quaternions_xyzw, axis=1)
-    if not (np.abs(lengths - 1) <= _LENGTH_TOLERANCE).all():
-        raise ValueError(
-            f"a quaternion has length {lengths[np.argmax(~(np.abs(lengths - 1) <= _LENGTH_TOLERANCE))]:g}"
-        )
+    is_unit = np.abs(lengths - 1) <= _LENGTH_TOLERANCE
+    if not is_unit.all():
+        raise ValueError(f"a quaternion has length {lengths[~is_unit][0]:g}")
     return se3.make(Rotation.from_quat(quaternions_xyzw).as_matrix(), positions)
 
 
@@ -130,16 +129,14 @@ def pose_files(paths: list[Path], stamps: FloatArray) -> FloatArray | None:
     """
     if not any(path.exists() for path in paths):
         return None
-    known, poses = [], []
-    for stamp, path in zip(stamps, paths):
-        pose = read_matrix(path, "a pose") if path.exists() else np.full((4, 4), np.nan)
-        if not np.isfinite(pose).all():
-            continue
-        if not se3.is_se3(pose, _ROTATION_TOLERANCE):
-            raise SequenceError(f"{path} holds no pose: its 3 x 3 part is not a rotation")
-        known.append(stamp)
-        poses.append(se3.rigid(pose))
-    return poses_near(np.array(poses).reshape(-1, 4, 4), np.array(known), stamps, paths[0].parent)
+    poses = np.full((len(paths), 4, 4), np.nan)
+    for k, path in enumerate(paths):
+        if path.exists():
+            poses[k] = read_matrix(path, "a pose")
+            if np.isfinite(poses[k]).all() and not se3.is_se3(poses[k], _ROTATION_TOLERANCE):
+                raise SequenceError(f"{path} holds no pose: its 3 x 3 part is not a rotation")
+    known = known_poses(poses)
+    return poses_near(se3.rigid(poses[known]), stamps[known], stamps, paths[0].parent)
 
 
 def read_truth(path: Path, stamps: FloatArray) -> FloatArray:
@@ -176,9 +173,6 @@ def read_truth(path: Path, stamps: FloatArray) -> FloatArray:
 
 def poses_beside(recording: Path) -> Path | None:
     """A file ``poses*.txt`` in or beside a recording; nothing tells whose poses they are."""
-    places = (
-        (recording, recording.absolute().parent)
-        if recording.is_dir()
-        else (recording.absolute().parent,)
-    )
-    return next((path for place in places for path in sorted(place.glob("poses*.txt"))), None)
+    place = recording.absolute()
+    found = [*sorted(place.glob("poses*.txt")), *sorted(place.parent.glob("poses*.txt"))]
+    return next(iter(found), None)

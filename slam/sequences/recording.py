@@ -215,13 +215,16 @@ class GrowingSequence(RecordedSequence):
     """A sequence that grows by a frame at a time; its images are not kept."""
 
     def __init__(
-        self, intrinsics: Intrinsics, camera_height_m: float | None, name: str = "live"
+        self,
+        camera: CameraFile | Intrinsics,
+        camera_height_m: float | None = None,
+        name: str = "live",
     ) -> None:
         def forgotten(index: int) -> Image:
             raise SlamError(f"frame {index} of a live drive is not kept")
 
-        images = ReadImages(intrinsics.width, intrinsics.height, 0, forgotten)
-        super().__init__(name, images, intrinsics, np.zeros(0), (), usual_height_m=camera_height_m)
+        images = ReadImages(camera.width, camera.height, 0, forgotten)
+        super().__init__(name, images, camera, np.zeros(0), (), usual_height_m=camera_height_m)
 
 
 def _reference(T_any_camera: FloatArray | None) -> FloatArray | None:

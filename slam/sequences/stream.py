@@ -28,7 +28,7 @@ from erfsfm.common.readers.images import (
 )
 from slam.frames import Frame, Image
 from slam.runtime.errors import SequenceError
-from slam.sequences.camera_file import DEFAULT_FPS, fixed_to, require_size, undistorted
+from slam.sequences.camera_file import DEFAULT_FPS, require_size
 from slam.sequences.recording import GrowingSequence
 
 logger = logging.getLogger(__name__)
@@ -81,9 +81,7 @@ class StreamedSequence(GrowingSequence):
             raise SequenceError(
                 f"{name} does not wait while an image is measured: leave out --every-frame"
             )
-        intrinsics, self._undistortion = undistorted(camera)
-        self._fixed = fixed_to(camera, self._undistortion)
-        super().__init__(intrinsics, camera.height_or(None), name)
+        super().__init__(camera, name=name)
         self.arrived_s: dict[int, float] = {}
         self.dropped, self.ended = 0, ""
         self._source, self._most_wait_s, self._every_frame = source, most_wait_s, every_frame
@@ -96,13 +94,13 @@ class StreamedSequence(GrowingSequence):
         self._thread.start()
         while (taken := self._take()) is not None:
             index, (stamp, image, at_s) = len(self), taken
-            image = image if self._undistortion is None else self._undistortion.apply(image)
+            image = image if self.undistortion is None else self.undistortion.apply(image)
             image.setflags(write=False)
             self.stamps = np.append(self.stamps, stamp)
             self.arrived_s = {k: v for k, v in self.arrived_s.items() if k >= index - 2} | {
                 index: at_s
             }
-            yield Frame(index, stamp, image, self._fixed)
+            yield Frame(index, stamp, image, self.fixed)
 
     def stop(self) -> None:
         """End after the images that wait."""

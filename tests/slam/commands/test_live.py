@@ -36,11 +36,9 @@ def street(kitti_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "images").mkdir()
     for path in images:
         shutil.copy(path, folder / "images" / path.name)
-    camera, no_lens = (
-        (kitti_root / "camera.yaml").read_text(),
-        "model: opencv\ndistortion: [0, 0, 0, 0]",
-    )
-    (folder / "camera.yaml").write_text(camera.replace("model: pinhole", no_lens))
+    camera = (kitti_root / "camera.yaml").read_text()
+    no_lens = "model: opencv\ndistortion: [0, 0, 0, 0]"
+    (folder / "camera.yaml").write_text(camera.replace("model: pinhole\ndistortion: []", no_lens))
     return folder
 
 

@@ -284,7 +284,9 @@ def _orb_slam(content: Keys) -> Keys:
     names = _ORB_COEFFICIENTS[model]
     keys = pinhole_keys(content["Camera.width"], content["Camera.height"], *focal)
     lens = {key: content[key] for key in content if _ORB_COEFFICIENT.fullmatch(key)}
-    distortion = _coefficients(lens, [f"{prefix}.{name}" for name in names], f"a {model} lens")
+    known = [f"{prefix}.{name}" for name in names]
+    _refuse_others(lens, known, f"a {model} lens")
+    distortion = [lens.get(name, 0.0) for name in known]
     return {**keys, "fps": content.get("Camera.fps"), "model": model, "distortion": distortion}
 
 
@@ -293,8 +295,9 @@ def _vins(content: Keys) -> Keys:
     pinhole = content["projection_parameters"]
     focal = (pinhole[name] for name in ("fx", "fy", "cx", "cy"))
     keys = pinhole_keys(content["image_width"], content["image_height"], *focal)
-    distortion = _coefficients(content["distortion_parameters"], _VINS_COEFFICIENTS, "VINS")
-    return {**keys, "model": "opencv", "distortion": distortion}
+    lens = content["distortion_parameters"]
+    _refuse_others(lens, _VINS_COEFFICIENTS, "VINS")
+    return {**keys, "model": "opencv", "distortion": [lens[name] for name in _VINS_COEFFICIENTS]}
 
 
 def _require_pinhole(content: Keys, key: str) -> None:
@@ -302,11 +305,9 @@ def _require_pinhole(content: Keys, key: str) -> None:
         raise DataError(f"the {key} {content[key]} is unknown: calibrate as pinhole")
 
 
-def _coefficients(lens: Keys, names: Sequence[str], whose: str) -> list[float]:
-    """Those of a lens that are named, in this order; ``DataError`` where others are not zero."""
+def _refuse_others(lens: Keys, names: Sequence[str], whose: str) -> None:
     if unused := [name for name, value in lens.items() if value and name not in names]:
         raise DataError(f"{', '.join(unused)} of {whose} cannot be used: give a camera.yaml")
-    return [lens.get(name, 0.0) for name in names]
 
 
 def _colmap(content: Keys) -> Keys:

@@ -118,16 +118,12 @@ def rotation_matrix(rotation_vector: FloatArray) -> FloatArray:
 
 def from_rotation_vector(rotation_vector: FloatArray, t_a_b: FloatArray) -> FloatArray:
     """``T_a_b`` from axis times angle in radians ``(..., 3)`` and translation ``(..., 3)``."""
-    return make(
-        Rotation.from_rotvec(rotation_vector).as_matrix(), np.asarray(t_a_b, dtype=np.float64)
-    )
+    return make(Rotation.from_rotvec(rotation_vector).as_matrix(), t_a_b)
 
 
 def tangent(T_a_b: FloatArray) -> FloatArray:
-    """Rotation vector and translation ``(..., 6)`` of ``(..., 4, 4)``: GTSAM's order, for small differences."""
-    R = T_a_b[..., :3, :3].reshape(-1, 3, 3)
-    turned = Rotation.from_matrix(R).as_rotvec().reshape(*T_a_b.shape[:-2], 3)
-    return np.concatenate([turned, T_a_b[..., :3, 3]], axis=-1)
+    """Rotation vectors and translations ``(N, 6)`` of ``(N, 4, 4)``: GTSAM's order, for small differences."""
+    return np.hstack([Rotation.from_matrix(T_a_b[:, :3, :3]).as_rotvec(), T_a_b[:, :3, 3]])
 
 
 def is_se3(T_a_b: FloatArray, tolerance: float = 1e-5) -> bool:

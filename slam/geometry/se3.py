@@ -34,6 +34,11 @@ def invert(T_a_b: FloatArray) -> FloatArray:
     return make(R_b_a, -(R_b_a @ T_a_b[..., :3, 3:])[..., 0])
 
 
+def in_unit(T_a_b: FloatArray, per_unit: float) -> FloatArray:
+    """A transform ``(4, 4)`` with its translation in another unit, of which an old one has ``per_unit``."""
+    return make(T_a_b[:3, :3], per_unit * T_a_b[:3, 3])
+
+
 def apply(T_a_b: FloatArray, points_b: FloatArray) -> FloatArray:
     """Points ``(N, 3)`` in b, moved to a by one ``(4, 4)`` transform."""
     points_a: FloatArray = points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.readers.camera_file import Pinhole
-from slam.geometry.se3 import BoolArray, FloatArray, invert
+from slam.geometry.se3 import BoolArray, FloatArray, in_unit, invert
 
 T = TypeVar("T")
 _Kind = TypeVar("_Kind", bound=np.generic)
@@ -269,13 +269,10 @@ class RelativePose:
 
     def scaled(self, scale: float) -> RelativePose:
         """The same measurement in another unit: translation and its sigmas times ``scale``."""
-        T_from_to = self.T_from_to.copy()
-        T_from_to[:3, 3] *= scale
         units = np.repeat([1.0, scale], 3)
         correlated = None if self.correlated_sigmas is None else self.correlated_sigmas * units
-        return replace(
-            self, T_from_to=T_from_to, sigmas=self.sigmas * units, correlated_sigmas=correlated
-        )
+        T_from_to, sigmas = in_unit(self.T_from_to, scale), self.sigmas * units
+        return replace(self, T_from_to=T_from_to, sigmas=sigmas, correlated_sigmas=correlated)
 
     @property
     def graph_sigmas(self) -> FloatArray:

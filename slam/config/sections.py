@@ -154,7 +154,7 @@ class GpsConfig(Section):
 class ScaleConfig(Section):
     """Metric scale, see ``frontend/scale_mode.py``."""
 
-    mode: Literal["auto", "none", "camera-height", "lidar", "reference", "known", "gps"] = Field(
+    mode: Literal["auto", ScaleMode] = Field(
         default="auto",
         description="auto: camera-height where a height is known, else gps with --gps, else none",
     )

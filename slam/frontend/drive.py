@@ -17,7 +17,6 @@ from slam.frontend.road import RoadStep, with_slope
 from slam.frontend.rotations import smooth_rotations
 from slam.frontend.visual.motion import Motion, Steps, triangulated
 from slam.geometry.se3 import FloatArray, path_distance
-from slam.runtime.errors import Failed
 
 logger = logging.getLogger(__name__)
 
@@ -203,8 +202,7 @@ def complete_drive(
         SlamError: no snippet was measured, so there is no motion to extrapolate.
     """
     if measured.is_upside_down:
-        roads: list[float | Failed] = [Failed("the images are upside down")] * len(measured)
-        measured = replace(measured, roads=roads, road_steps={})
+        measured = replace(measured, roads=[None] * len(measured), road_steps={})
     ends = {*measured.steps, *map_poses.steps}
     cuts = find_cuts(measured.failures, ends, {*measured.unusable, *measured.repeated})
     filled = interpolate_gaps(measured, sources, cuts, map_poses)

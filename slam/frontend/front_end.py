@@ -17,8 +17,7 @@ from slam.frontend.keyframes.submaps import parts_of
 from slam.frontend.keyframes.units import learned_unit
 from slam.frontend.measured import LAST_STEPS, FrontEnd, Measured
 from slam.frontend.visual.step_tracker import Beside, Seen, StepTracker
-from slam.geometry.se3 import FloatArray, invert, length_of, normalised
-from slam.runtime.errors import Failed
+from slam.geometry.se3 import FloatArray, in_unit, invert, length_of, normalised
 from slam.runtime.stopwatch import Stopwatch
 
 # looked back for the frame before, and keyframes that give the unit
@@ -128,11 +127,8 @@ class MotionTracker:
         if len(located) < 2 or located[-1][0] != index:
             return None
         (before, T_before_map), (_, T_frame_map) = located[-2:]
-        T_before_frame = T_before_map @ invert(T_frame_map)
-        T_before_frame[:3, 3] *= learned_unit(
-            LocalMap(segment.keyframes[-_KEYFRAMES:], segment.points)
-        )
-        return before, T_before_frame
+        unit = learned_unit(LocalMap(segment.keyframes[-_KEYFRAMES:], segment.points))
+        return before, in_unit(T_before_map @ invert(T_frame_map), unit)
 
     def finish(self) -> Measured:
         """All that was measured so far, which stays while more frames follow.
@@ -190,7 +186,7 @@ def _is_on_vehicle(measured: Measured) -> bool | None:
     )
     if len(first) < _CLEAR_STEPS:
         return None
-    heights = [road for road in measured.roads if not isinstance(road, Failed)]
+    heights = [road for road in measured.roads if road is not None]
     speeds = [motion.length_unscaled / motion.seconds for motion in first]
     is_fast = bool(heights) and bool(np.median(speeds) >= _VEHICLE_SPEED * np.median(heights))
     steps = np.array([motion.relative_pose.T_from_to[:3, 3] for motion in first])

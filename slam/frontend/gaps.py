@@ -103,7 +103,7 @@ def interpolate_gaps(
 def _is_trusted(snippet: SnippetPoses, frozen: Collection[int], cuts: Collection[int]) -> bool:
     """Whether a snippet sees no frozen frame and does not measure across a cut."""
     span = {snippet.target, *snippet.sources}
-    return span.isdisjoint(frozen) and not any(min(span) < cut <= max(span) for cut in cuts)
+    return span.isdisjoint(frozen) and set(cuts).isdisjoint(range(min(span) + 1, max(span) + 1))
 
 
 def _guess(k: int, T_k_next: FloatArray, typical: float) -> RelativePose:

@@ -12,7 +12,6 @@ import numpy as np
 from slam.frames import DepthMap, Intrinsics
 from slam.frontend.visual.depth_error import DepthError
 from slam.geometry.se3 import BoolArray, FloatArray, length_of
-from slam.runtime.errors import Failed
 
 _POINTS = 1500  # approximate number of pixels
 _LEAST_POINTS = 50  # with a usable depth
@@ -53,32 +52,26 @@ class GroundPlaneFitter:
         v, u = np.broadcast_to(rows, across.shape)[is_road], across[is_road].astype(np.int64)
         self._rows, self._columns, self._rays = v, u, intrinsics.rays(np.stack([u, v], axis=-1))
 
-    def fit(self, depth_unscaled: DepthMap, error: DepthError) -> float | Failed:
+    def fit(self, depth_unscaled: DepthMap, error: DepthError) -> float | None:
         """The camera's unscaled height over the plane of learned z-depth ``(H, W)`` without the bias by its ``error``.
 
-        The depth is at the size of the intrinsics; where it is unknown it is left out.
+        The depth is at the size of the intrinsics; where it is unknown it is left out. None where too few pixels have
+        one, or lie on one plane that is about level.
         """
         depth = error.corrected(depth_unscaled[self._rows, self._columns].astype(np.float64))
         inverse_depth = 1.0 / np.maximum(depth, 1e-9)
         usable = (inverse_depth > 0) & (inverse_depth < 1e8)  # false for NaN
         if usable.sum() < _LEAST_POINTS:
-            return Failed("the depth in front of the car is not usable")
+            return None
         rays, inverse_depth = self._rays[usable], inverse_depth[usable]  # (P, 3), (P,)
         scaled_normal = _ransac(rays, inverse_depth, self._seed)
         if scaled_normal is None:
-            return Failed(f"no plane within {_MAX_TILT_DEG:g} deg of level in front of the car")
+            return None
         scaled_normal = _reweighted(rays, inverse_depth, scaled_normal)
         height = 1.0 / length_of(scaled_normal)
         inlier_ratio = float(_inliers(rays, inverse_depth, scaled_normal[None])[0].mean())
-        if scaled_normal[1] * height < np.cos(np.deg2rad(_MAX_TILT_DEG)):
-            return Failed(
-                f"the plane in front of the car is tilted by more than {_MAX_TILT_DEG:g} deg"
-            )
-        if inlier_ratio < _MIN_INLIER_RATIO:
-            return Failed(
-                f"only {inlier_ratio:.0%} of the pixels in front of the car lie on one plane"
-            )
-        return height
+        is_level = scaled_normal[1] * height >= np.cos(np.deg2rad(_MAX_TILT_DEG))
+        return height if is_level and inlier_ratio >= _MIN_INLIER_RATIO else None
 
 
 def _ransac(rays: FloatArray, inverse_depth: FloatArray, seed: int) -> FloatArray | None:

@@ -94,9 +94,9 @@ def lidar_steps(path: LidarPath) -> list[RelativePose]:
     sigmas = np.repeat([np.deg2rad(_ROTATION_SIGMA_DEG), _TRANSLATION_SIGMA_M], 3)
     T_previous_current = invert(path.T_world_camera[:-1]) @ path.T_world_camera[1:]
     return [
-        RelativePose(int(first), int(second), T, sigmas, LIDAR_SOURCE)
-        for first, second, T in zip(
-            path.frames[:-1], path.frames[1:], T_previous_current, strict=True
+        RelativePose(first, second, T, sigmas, LIDAR_SOURCE)
+        for (first, second), T in zip(
+            itertools.pairwise(path.frames.tolist()), T_previous_current, strict=True
         )
         if second == first + 1
     ]

@@ -29,7 +29,6 @@ from slam.frontend.road import RoadStep
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.motion import Motion, RelativeRotation, Steps
 from slam.geometry.se3 import FloatArray
-from slam.runtime.errors import Failed
 from slam.runtime.memory import Spilled, SpillFile
 
 T = TypeVar("T")
@@ -95,7 +94,7 @@ class Measured:
         relative_rotations: rotations across several steps.
         failures: steps that image geometry could not measure, with the share of corners that were
             found again.
-        roads: of every frame, the camera's height over the ground plane.
+        roads: of every frame, the camera's height over the ground plane, None where it was not seen.
         views: of frames among which loops are sought.
         keyframes: frames for the map.
         unusable: frames without a measurement, with the reason.
@@ -117,7 +116,7 @@ class Measured:
     road_steps: dict[Ends, RoadStep] = field(default_factory=dict)
     relative_rotations: dict[Ends, RelativeRotation] = field(default_factory=dict)
     failures: dict[Ends, float] = field(default_factory=dict)
-    roads: list[float | Failed] = field(default_factory=list)
+    roads: list[float | None] = field(default_factory=list)
     views: list[View] = field(default_factory=list)
     keyframes: list[Keyframe] = field(default_factory=list)
     unusable: dict[int, str] = field(default_factory=dict)

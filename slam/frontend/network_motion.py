@@ -15,7 +15,7 @@ import numpy as np
 
 from slam.frames import RelativePose, SnippetPoses
 from slam.geometry.robust import MAD_TO_SIGMA, median, running_median
-from slam.geometry.se3 import FloatArray, chain, invert, rigid, tangent
+from slam.geometry.se3 import FloatArray, chain, in_unit, invert, rigid, tangent
 
 NETWORK_SOURCE = "network"
 STUDENT_T_DOF = 12.0  # of the errors of measured steps: degrees of freedom of Student's t
@@ -67,11 +67,7 @@ class NetworkCalibration:
 
     def scaled(self, steps: Mapping[int, FloatArray]) -> dict[int, FloatArray]:
         """Steps ``T_k_next`` by k in the unit."""
-        scaled = {}
-        for k, T_k_next in steps.items():
-            scaled[k] = T_k_next.copy()
-            scaled[k][:3, 3] *= self.unit[k]
-        return scaled
+        return {k: in_unit(T_k_next, self.unit[k]) for k, T_k_next in steps.items()}
 
 
 def network_steps(snippets: Sequence[SnippetPoses]) -> dict[int, FloatArray]:

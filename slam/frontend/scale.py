@@ -253,12 +253,12 @@ def height_by_lidar(lidar_steps: Sequence[RelativePose], drive: Drive) -> float 
     if not heights:
         for ends, motion in drive.triangulated.items():
             plane = drive.measured.roads[ends[0]]
-            if ends in metres and not isinstance(plane, Failed):
+            if ends in metres and plane is not None:
                 heights.append(metres[ends] / motion.length_unscaled * plane)
     return median(heights) if heights else None
 
 
-def scale_from_road(roads: Sequence[float | Failed], height: float = 1.0) -> ScaleEstimate | Failed:
+def scale_from_road(roads: Sequence[float | None], height: float = 1.0) -> ScaleEstimate | Failed:
     """Unit of the camera's ``height`` per unscaled length: metres, or camera heights where it is 1.
 
     The median over the frames without outliers, which are many MADs away.
@@ -273,9 +273,9 @@ def scale_from_road(roads: Sequence[float | Failed], height: float = 1.0) -> Sca
     return ScaleEstimate(float(np.exp(np.median(kept))), spread, len(kept))
 
 
-def _ratios(roads: Sequence[float | Failed], height: float) -> FloatArray:
+def _ratios(roads: Sequence[float | None], height: float) -> FloatArray:
     """The camera's height over that above each ground plane ``(N,)``, NaN without one."""
-    return np.array([np.nan if isinstance(road, Failed) else height / road for road in roads])
+    return height / np.array(roads, np.float64)
 
 
 @dataclass(frozen=True)

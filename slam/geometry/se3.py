@@ -34,6 +34,11 @@ def invert(T_a_b: FloatArray) -> FloatArray:
     return make(R_b_a, -(R_b_a @ T_a_b[..., :3, 3:])[..., 0])
 
 
+def in_unit(T_a_b: FloatArray, per_unit: float) -> FloatArray:
+    """A transform ``(4, 4)`` with its translation in another unit, of which an old one has ``per_unit``."""
+    return make(T_a_b[:3, :3], per_unit * T_a_b[:3, 3])
+
+
 def apply(T_a_b: FloatArray, points_b: FloatArray) -> FloatArray:
     """Points ``(N, 3)`` in b, moved to a by one ``(4, 4)`` transform."""
     points_a: FloatArray = points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
@@ -118,16 +123,12 @@ def rotation_matrix(rotation_vector: FloatArray) -> FloatArray:
 
 def from_rotation_vector(rotation_vector: FloatArray, t_a_b: FloatArray) -> FloatArray:
     """``T_a_b`` from axis times angle in radians ``(..., 3)`` and translation ``(..., 3)``."""
-    return make(
-        Rotation.from_rotvec(rotation_vector).as_matrix(), np.asarray(t_a_b, dtype=np.float64)
-    )
+    return make(Rotation.from_rotvec(rotation_vector).as_matrix(), t_a_b)
 
 
 def tangent(T_a_b: FloatArray) -> FloatArray:
-    """Rotation vector and translation ``(..., 6)`` of ``(..., 4, 4)``: GTSAM's order, for small differences."""
-    R = T_a_b[..., :3, :3].reshape(-1, 3, 3)
-    turned = Rotation.from_matrix(R).as_rotvec().reshape(*T_a_b.shape[:-2], 3)
-    return np.concatenate([turned, T_a_b[..., :3, 3]], axis=-1)
+    """Rotation vectors and translations ``(N, 6)`` of ``(N, 4, 4)``: GTSAM's order, for small differences."""
+    return np.hstack([Rotation.from_matrix(T_a_b[:, :3, :3]).as_rotvec(), T_a_b[:, :3, 3]])
 
 
 def is_se3(T_a_b: FloatArray, tolerance: float = 1e-5) -> bool:

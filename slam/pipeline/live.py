@@ -21,7 +21,7 @@ from slam.frontend.drive import Drive, complete_drive
 from slam.frontend.factors import chain_odometry, make_factors
 from slam.frontend.measured import LAST_STEPS, Measured, frame_support
 from slam.frontend.scale import Scale, Unit, find_scale
-from slam.geometry.se3 import FloatArray, apply, compose, invert
+from slam.geometry.se3 import FloatArray, apply, compose, in_unit, invert
 from slam.loops.closure import LoopClosures
 from slam.loops.places import PlaceStructure
 from slam.loops.verification import OF_KEYFRAMES
@@ -127,9 +127,9 @@ class LivePoses:
             before, T_before_frame = by_keyframes
             self._settled = index
         elif motion is not None and motion.ends[0] == before:
-            T_before_frame = motion.relative_pose.T_from_to.copy()
+            T_before_frame = motion.relative_pose.T_from_to
         if T_before_frame is not None:
-            T_before_frame[:3, 3] *= self.unit
+            T_before_frame = in_unit(T_before_frame, self.unit)
         else:  # the camera goes on as it went
             T_before_frame = (
                 invert(self._T_world_camera[max(before - 1, 0)]) @ self._T_world_camera[before]

@@ -191,12 +191,13 @@ def _joined(
     chosen = np.flatnonzero(np.isin(rows.maps, members))
     place = np.full(len(rows.keyframes), -1)
     place[chosen] = np.arange(len(chosen))
+    maps, T_map_camera = rows.maps[chosen], rows.T_map_camera[chosen]
     edges, shared = [], []
     # between neighbouring keyframes of one map, whose unit hardly changes
-    for first, row in enumerate(chosen):
+    for first in range(len(chosen)):
         for last in range(first + 1, min(first + 1 + _NEIGHBOURS, len(chosen))):
-            if rows.maps[row] == rows.maps[chosen[last]]:
-                T_step = invert(rows.T_map_camera[row]) @ rows.T_map_camera[chosen[last]]
+            if maps[first] == maps[last]:
+                T_step = invert(T_map_camera[first]) @ T_map_camera[last]
                 length = _RELATIVE_SIGMA * length_of(T_step[:3, 3]) + _LEAST_SIGMA
                 sigmas = np.repeat([_ROTATION_SIGMA, length], 3)
                 pose = RelativePose(first, last, T_step, sigmas, KEYFRAME_SOURCE)

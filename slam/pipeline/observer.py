@@ -187,7 +187,7 @@ class Observer:
             self._measure_pending()
         finally:  # the error is of the frame before
             self.measured.unusable[index] = reason
-            self.measured.roads.append(Failed(reason))
+            self.measured.roads.append(None)
             self._snippet_frames = ()
 
     def _ask_networks(self, frame: Frame) -> FrameInWork:
@@ -202,9 +202,7 @@ class Observer:
         has_moved = False  # whether as many more steps as this one leave what the last predicted depth shows
         if step is not None:
             roads = measured.roads[: step.ends[1] + 1][-_LAST_ROADS:]
-            height = next(
-                (road for road in reversed(roads) if not isinstance(road, Failed)), math.inf
-            )
+            height = next((road for road in reversed(roads) if road is not None), math.inf)
             way = (index + 1 - self._depth_index) * step.length_unscaled
             has_moved = way > _MOVED_ON_HEIGHTS * height
         after_frozen = measured.repeated[-1:] == [index - 1]  # what it hid is not carried
@@ -263,7 +261,7 @@ class Observer:
             reason = f"it could not be measured: {explained(error)}"
             self.measured.unusable[index] = reason
             if len(self.measured) == index:  # one entry in ``roads`` as all frames
-                self.measured.roads.append(Failed(reason))
+                self.measured.roads.append(None)
             self._failed += 1
             is_known = isinstance(error, OneLineError | OSError | MemoryError)
             if is_known or shows_traceback() or not self._is_gap(self._failed):
@@ -279,7 +277,7 @@ class Observer:
         beside = self.tracker.add([each.frame for each in self._recent], current.frame)
         self._finish_tasks()
         self.tracker.choose()
-        self.measured.roads.append(Failed("its depth was not predicted"))
+        self.measured.roads.append(None)
         self._recent = (*self._recent, current)[-ROTATION_BASELINE:]
         if current.snippet is not None:
             self._tasks.append(("pose network", current.snippet, self._keep_snippet))
@@ -297,9 +295,9 @@ class Observer:
         if frame.fixed is not None:
             depth = np.where(resized_mask(frame.fixed, *depth.shape[::-1]), np.float32(0), depth)
         with self._stopwatch.stage("road"):
-            self.measured.roads[frame.index] = road = self._plane.fit(depth, error)
+            self.measured.roads[frame.index] = current.height = self._plane.fit(depth, error)
         self.tracker.learn(frame, depth)
-        current.depth, current.height = depth, None if isinstance(road, Failed) else road
+        current.depth = depth
         views, loops = self.measured.views, self._config.loops
         if loops.enabled and (not views or frame.index - views[-1].index >= _LOOP_STRIDE):
             with self._stopwatch.stage("loops"):
@@ -315,8 +313,8 @@ class Observer:
             recent.depth = self._carried(recent)
         if recent.depth is None:
             recent.depth = self._predict(frame).result()
-            road = self._plane.fit(recent.depth, self.tracker.step_odometry.depth_error)
-            recent.height = None if isinstance(road, Failed) else road
+            error = self.tracker.step_odometry.depth_error
+            recent.height = self._plane.fit(recent.depth, error)
         return frame, recent.depth, recent.height
 
     def _carried(self, recent: FrameInWork) -> DepthMap | None:

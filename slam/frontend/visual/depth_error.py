@@ -107,13 +107,11 @@ class DepthError:
         counted = bias[corners > _FAR_CORNERS * corners.max()]
         return float(counted.max()) if len(counted) else None
 
-    def curve(self) -> list[tuple[float, float, float, float]]:
+    def curve(self) -> list[list[float]]:
         """Learned depth, its bias (logarithm), its relative sigma and the corners seen there, where there are many."""
         corners = self.corners.sum(axis=1)
-        rows = zip(_DEPTHS, self.bias, self._spread, corners, strict=True)
-        return [
-            (float(d), float(b), float(s), float(n)) for d, b, s, n in rows if n > _PRIOR_CORNERS
-        ]
+        rows = np.column_stack([_DEPTHS, self.bias, self._spread, corners])
+        return rows[corners > _PRIOR_CORNERS].tolist()
 
     @cached_property
     def bias(self) -> FloatArray:

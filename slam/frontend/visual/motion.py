@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam.frames import Ends, RelativePose
-from slam.geometry.se3 import FloatArray, invert, length_of
+from slam.geometry.se3 import FloatArray, in_unit, invert, length_of
 
 _LEAST_RELATIVE_SIGMA = 1e-3
 
@@ -73,8 +73,7 @@ class Motion:
             noise: sigmas ``(6,)`` of rotation and direction, added in squares to those of the
                 corners.
         """
-        T_previous_current = self.relative_pose.T_from_to.copy()
-        T_previous_current[:3, 3] *= length / self.length_unscaled
+        T_previous_current = in_unit(self.relative_pose.T_from_to, length / self.length_unscaled)
         of_unit_pose = np.hypot(self.corner_sigmas, noise)
         return replace(
             self.relative_pose,

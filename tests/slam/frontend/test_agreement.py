@@ -102,10 +102,7 @@ def driven(
     for k, pose in enumerate(poses):
         steps[pose.ends] = Motion(pose, 1e-4 * np.eye(6), support=0.1 if k < weak else support)
     drive = Drive(
-        Measured(
-            roads=[Failed("not asked")] * (FRAMES + 1),
-            below_is_nearer=[k >= turned for k in range(FRAMES)],
-        ),
+        Measured(roads=[None] * (FRAMES + 1), below_is_nearer=[k >= turned for k in range(FRAMES)]),
         steps=steps,
         road_steps=dict.fromkeys([pose.ends for pose in poses[:on_road]]),
         segments=[Segment(k, k, "another place") for k in range(segments)],

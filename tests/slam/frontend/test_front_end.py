@@ -22,7 +22,6 @@ from slam.frontend.measured import FrontEnd, Measured
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector
 from slam.pipeline.observer import Observer
-from slam.runtime.errors import Failed
 from slam.runtime.stopwatch import Stopwatch
 
 KEYFRAMES_ALONE = SlamConfig(
@@ -65,7 +64,7 @@ def test_a_vehicle_goes_the_same_way_for_a_while_and_fast(
 ):
     drive = steps(count, scatter, seconds)
     assert choose(KeyframesConfig(), None, drive) is front_end
-    drive.roads[:] = [Failed("no road")] * count
+    drive.roads[:] = [None] * count
     assert choose(KeyframesConfig(), None, drive) is not FrontEnd.STEPS
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 import pytest
 
@@ -11,13 +9,12 @@ from slam.frames import DepthMap, Intrinsics
 from slam.frontend.ground_plane import GroundPlaneFitter
 from slam.frontend.scale import ScaleEstimate, scale_from_road
 from slam.frontend.visual.depth_error import DepthError
-from slam.runtime.errors import Failed
 
 LEVEL_CAMERA = Intrinsics(416, 128, 240.0, 240.0, 207.5, 63.5)
 HEIGHT = 0.37
 
 
-def fit_ground_plane(depth: DepthMap, seed: int = 0) -> float | Failed:
+def fit_ground_plane(depth: DepthMap, seed: int = 0) -> float | None:
     return GroundPlaneFitter(LEVEL_CAMERA, seed).fit(depth, DepthError())
 
 
@@ -62,7 +59,7 @@ def test_unknown_depth_is_left_out(unknown):
     road = fit_ground_plane(depth)
     assert road == pytest.approx(HEIGHT, rel=1e-4)
     depth[:] = unknown
-    assert isinstance(fit_ground_plane(depth), Failed)
+    assert fit_ground_plane(depth) is None
 
 
 def test_a_car_ahead_does_not_move_the_road():
@@ -80,18 +77,14 @@ def test_two_seeds_give_other_ransac_draws_and_one_seed_the_same():
 
 
 @pytest.mark.parametrize(
-    ("depth", "reason"),
+    "depth",
     [
-        (np.full((128, 416), np.nan, np.float32), "not usable"),
-        (np.full((128, 416), 12.0, np.float32), "no plane within 12 deg"),
-        (road_depth(roll_deg=25.0), "no plane within 12 deg"),
-        (
-            np.random.default_rng(0).uniform(1, 30, (128, 416)).astype(np.float32),
-            "no plane within|only .* one plane|tilted",
-        ),
+        np.full((128, 416), np.nan, np.float32),
+        np.full((128, 416), 12.0, np.float32),
+        road_depth(roll_deg=25.0),
+        np.random.default_rng(0).uniform(1, 30, (128, 416)).astype(np.float32),
     ],
+    ids=["unknown", "wall", "tilted", "noise"],
 )
-def test_what_is_no_plane_is_refused_with_a_reason(depth, reason):
-    failure = fit_ground_plane(depth)
-    assert isinstance(failure, Failed)
-    assert re.search(reason, failure.reason)
+def test_what_is_no_level_plane_is_refused(depth):
+    assert fit_ground_plane(depth) is None

@@ -63,7 +63,7 @@ def measured(
 ) -> tuple[Drive, list[RelativePose]]:
     """A straight drive; ``bias`` makes the learned road lie too near, the first ``lidar`` steps have scans."""
     motions = {ends: Motion(step(ends, UNIT, "essential"), np.eye(6)) for ends in steps}
-    plane = bias * HEIGHT_M * UNIT if planes else Failed("dark")
+    plane = bias * HEIGHT_M * UNIT if planes else None
     roads = (
         {ends: RoadStep(metres(ends) / height_m * DOWN, np.eye(3), DOWN, 0.06) for ends in steps}
         if road
@@ -217,7 +217,7 @@ def test_a_later_estimate_scales_everything_and_a_failure_nothing():
 def test_a_floor_seen_now_and_then_gives_no_metric_unit(share, unit):
     drive, scans = measured(road=False)
     seen = int(share * FRAMES)
-    roads = [*drive.measured.roads[:seen], *[Failed("a table")] * (FRAMES - seen)]
+    roads = [*drive.measured.roads[:seen], *[None] * (FRAMES - seen)]
     drive = replace(drive, measured=Measured(roads=roads))
     scale = find("none", (drive, scans), None)
     assert scale.unit == scale.unit_name == unit

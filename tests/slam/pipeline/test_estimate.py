@@ -15,7 +15,6 @@ from slam.frontend.measured import Keyframe, Measured
 from slam.frontend.visual.depth_error import DepthError
 from slam.mapping.depth import KeyframeDepth
 from slam.pipeline.estimate import keyframe_depths
-from slam.runtime.errors import Failed
 from slam.runtime.memory import SpillFile
 
 CAMERA = Intrinsics(64, 32, 50.0, 50.0, 31.5, 15.5)
@@ -34,7 +33,7 @@ def depths(
     wall = np.full((32, 64), 2.5, np.float32)
     wall[24:] = 0  # as where an image shows what is fixed to its camera
     keyframes = [Keyframe.of(frame, wall, spill_file) for frame in frames]
-    drive = Drive(Measured(keyframes=keyframes, roads=[Failed("no road")] * FRAMES))
+    drive = Drive(Measured(keyframes=keyframes, roads=[None] * FRAMES))
     T_world_camera = np.tile(np.eye(4), (FRAMES, 1, 1))
     T_world_camera[:, 0, 3] = step * np.arange(FRAMES)
     scale = np.full(FRAMES, 2.0)

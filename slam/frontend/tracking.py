@@ -38,9 +38,6 @@ ROTATION_BASELINE = 2
 LONGEST_STEP = 30  # frames across which corners are compared where nothing can be told apart
 # tracks below which they are sought again, with the wide window and equal exposure
 FEW_CORNERS = 60
-# of a local mean, pixels: that of coarse windows, 128 px wide, keeps their blobs (31 px: kitchen 0.031 m for 0.027)
-_SURROUNDINGS = (127, 127)
-_SAME_EXPOSURE = 0.03  # logarithm: neighbouring images of one exposure differ by 0.015
 # no corners, and the identifiers of their tracks
 _NOTHING = np.zeros((0, 2), np.float32), np.zeros(0, np.int64)
 _WIDE_WINDOW_PX = 31  # side of the window after most tracks were lost, pixels
@@ -108,21 +105,6 @@ def track(
     returned, backward = _lucas_kanade(second, first, moved, start, back)
     near = np.linalg.norm(returned - pixels, search.norm, axis=1) < search.error_px
     return moved, forward & backward & near
-
-
-def evened(first: Grey, second: Grey, exposures: float) -> tuple[Grey, Grey]:
-    """Two images ``(H, W)``, without their local mean where the logarithms of their exposures differ.
-
-    On plain walls a change of exposure looks like motion.
-    """
-    if abs(exposures) < _SAME_EXPOSURE:
-        return first, second
-    means = (cv2.blur(grey, _SURROUNDINGS) for grey in (first, second))
-    one, other = (
-        np.asarray(cv2.addWeighted(grey, 1.0, mean, -1.0, 128.0))
-        for grey, mean in zip((first, second), means, strict=True)
-    )
-    return one, other
 
 
 def _lucas_kanade(

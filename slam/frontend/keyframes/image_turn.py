@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 from slam.frames import Grey, Intrinsics, slopes_of
 from slam.frontend.tracking import Pixels
 from slam.geometry.multiview import rotation_between
-from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray, compose, rotation_matrix
 
 _REDUCED = 8  # an image over the small one
@@ -57,14 +56,6 @@ def image_shift(before: SmallImage, now: SmallImage) -> FloatArray:
     window = cv2.createHanningWindow(now.shape[::-1], cv2.CV_32F)
     shift, _ = cv2.phaseCorrelate(before.copy(), now.copy(), window)  # which writes into them
     return _REDUCED * np.asarray(shift)
-
-
-def exposed(before: SmallImage, now: SmallImage, shift: FloatArray) -> float:
-    """The logarithm of the exposure of an image over that of the last one, which moved by pixels ``(2,)``."""
-    if before.shape != now.shape:
-        return 0.0
-    rolled = np.roll(before, np.rint(shift[::-1] / _REDUCED).astype(int), (0, 1))
-    return median(np.log((now + 1.0) / (rolled + 1.0)))
 
 
 def image_turn(

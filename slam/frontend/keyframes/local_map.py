@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from slam.frames import DepthMap, Descriptors, Grey, Intrinsics, RelativePose, View, nearest_depth
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Sightings
 from slam.frontend.keyframes.image_turn import turned
-from slam.frontend.tracking import KEYFRAME_SEARCH, Pixels, are_inside, evened, track
+from slam.frontend.tracking import KEYFRAME_SEARCH, Pixels, are_inside, track
 from slam.geometry.multiview import PIXEL_SIGMA
 from slam.geometry.robust import median, weighted_median
 from slam.geometry.se3 import FloatArray, apply, compose, invert
@@ -109,8 +109,7 @@ class TrackedKeyframe:
     ``places`` ``(M, 2)`` are where its image has them: with a rolling shutter, pixels are as of the
     middle row. ``learned_depth`` ``(M,)`` is positive, NaN where unknown, ``descriptors`` are
     ``(M, 32)``; ``grey`` is None once the image is not kept any more. After a turn on the spot
-    (``is_turn``) corners say nothing of where the camera is. ``exposure`` is a logarithm, over that
-    of the first image.
+    (``is_turn``) corners say nothing of where the camera is.
     """
 
     index: int
@@ -122,7 +121,6 @@ class TrackedKeyframe:
     descriptors: Descriptors
     grey: Grey | None
     is_turn: bool = False
-    exposure: float = 0.0
 
     def with_depth(self, depth: DepthMap) -> TrackedKeyframe:
         """The same with learned depth ``(H, W)`` at its corners."""
@@ -399,11 +397,8 @@ class TrackedFrame:
 class NewImage:
     """An image that becomes a keyframe, in which corners of earlier ones are found."""
 
-    def __init__(
-        self, grey: Grey, T_camera_world: FloatArray, intrinsics: Intrinsics, exposure: float = 0.0
-    ) -> None:
+    def __init__(self, grey: Grey, T_camera_world: FloatArray, intrinsics: Intrinsics) -> None:
         self._grey, self.T_camera_world, self.intrinsics = grey, T_camera_world, intrinsics
-        self._exposure = exposure
         self._turned: dict[int, Grey] = {}  # images of keyframes as the new camera is turned
 
     def matched(
@@ -411,8 +406,7 @@ class NewImage:
     ) -> tuple[Pixels, NDArray[np.bool_]]:
         """Some corners of a keyframe from guesses ``(M, 2)``, and which were found ``(M,)``."""
         image, pixels = self._as_turned(keyframe)
-        images = evened(image, self._grey, self._exposure - keyframe.exposure)
-        matched, kept = track(*images, pixels[rows], _MATCHED, guesses)
+        matched, kept = track(image, self._grey, pixels[rows], _MATCHED, guesses)
         return matched, kept & are_inside(matched, self._grey.shape)
 
     def flowed(self, keyframe: TrackedKeyframe) -> tuple[TrackIds, Pixels]:

@@ -22,7 +22,6 @@ from slam.frontend.keyframes.first_motion import first_motion
 from slam.frontend.keyframes.image_turn import (
     ImageTurn,
     SmallImage,
-    exposed,
     image_shift,
     image_turn,
     in_middle_row,
@@ -39,7 +38,7 @@ from slam.frontend.keyframes.local_map import (
     TrackIds,
 )
 from slam.frontend.keyframes.relocalisation import Relocaliser
-from slam.frontend.tracking import KEYFRAME_SEARCH, Pixels, are_inside, evened, new_corners, track
+from slam.frontend.tracking import KEYFRAME_SEARCH, Pixels, are_inside, new_corners, track
 from slam.geometry.multiview import (
     INLIER_PX,
     MIN_POINTS,
@@ -114,7 +113,6 @@ class KeyframeOdometry:
         self._T_camera_world = self._T_last_step = np.eye(4)
         self._lost, self._stamp = 0, 0.0
         self._turn_rate = np.zeros(3)  # a second, where the shutter rolls
-        self._exposure = 0.0  # logarithm, over that of the first image
         self._small: SmallImage = np.zeros((0, 0), np.float32)
         self.events: list[TrackingEvent] = []
         # of the points of the last keyframe, once it is asked for
@@ -164,7 +162,6 @@ class KeyframeOdometry:
     def _follow(self, frame: Frame) -> None:
         before, self._small = self._small, small_image(frame.grey)
         shift = image_shift(before, self._small)
-        self._exposure += exposed(before, self._small, shift)
         images = before, self._small, self._T_last_step[:3, :3], shift, self._intrinsics
         turn = image_turn(*images) if np.hypot(*shift) > _LEAST_SHIFT_PX else None
         since, self._stamp = frame.stamp - self._stamp, frame.stamp
@@ -188,7 +185,7 @@ class KeyframeOdometry:
         turn = image_turn(*images) if turn is None else turn
         self._T_last_step = make(turn.R_now_before, np.zeros(3))
         T_turned = compose(self._T_last_step, self._T_camera_world)
-        image = NewImage(frame.grey, T_turned, self._intrinsics, self._exposure)
+        image = NewImage(frame.grey, T_turned, self._intrinsics)
         track_ids, pixels = image.flowed(segment.keyframes[-1])
         seen = ~frame.is_fixed(pixels)
         if self._locate(segment, frame, track_ids[seen], pixels[seen], is_doubtful=True):
@@ -243,8 +240,7 @@ class KeyframeOdometry:
         if turn is not None and turn.correlation > _LEAST_CORRELATION:
             guesses = turned(guesses, turn.R_now_before, self._intrinsics)
         corners = keyframe.places[rows].astype(np.float32)
-        images = evened(keyframe.grey, frame.grey, self._exposure - keyframe.exposure)
-        tracked, kept = track(*images, corners, KEYFRAME_SEARCH, guesses)
+        tracked, kept = track(keyframe.grey, frame.grey, corners, KEYFRAME_SEARCH, guesses)
         kept &= are_inside(tracked, frame.grey.shape) & ~frame.is_fixed(tracked)
         shift = np.zeros(2, np.float32)
         if kept.any():
@@ -360,7 +356,7 @@ class KeyframeOdometry:
         intrinsics = self._intrinsics
         T, is_tracked = self._T_camera_world, len(track_ids) > 0
         if is_tracked:
-            image = NewImage(frame.grey, T, intrinsics, self._exposure)
+            image = NewImage(frame.grey, T, intrinsics)
             pixels = segment.aligned(image, track_ids, pixels)
             again, reprojected = segment.found_again(image, track_ids)
             track_ids = np.concatenate([track_ids, again])
@@ -374,16 +370,7 @@ class KeyframeOdometry:
         middle = in_middle_row(places, self._turn_rate, intrinsics)
         descriptors = describe(frame.grey, places)
         keyframe = TrackedKeyframe(
-            frame.index,
-            T,
-            track_ids,
-            middle,
-            places,
-            unknown,
-            descriptors,
-            frame.grey,
-            is_turn,
-            self._exposure,
+            frame.index, T, track_ids, middle, places, unknown, descriptors, frame.grey, is_turn
         )
         segment.add(keyframe)
         if is_tracked and not is_turn:

@@ -41,13 +41,13 @@ def test_a_map_begins_on_a_plane(seed: int):
     assert room.errors(poses(room.tracked(truth, near=False, draws=seed)), truth)[1] < 1.5
 
 
-def test_blur_and_exposure_of_a_turn_on_the_spot_are_no_motion():
-    """Corners of blurred images agree on a translation, and walls that darken seem to move: 0.6 degrees for either."""
+def test_blur_of_a_turn_on_the_spot_is_no_motion():
+    """Corners of blurred images agree on a translation: without the turn, rotations were 0.6 degrees off."""
     moments = room.walk(152, step_m=0.0, turn=0.005)
     odometry = KeyframeOdometry(room.INTRINSICS)
     for k in range(38):
-        exposed = np.mean([room.image(T) for T in moments[4 * k : 4 * k + 3]], axis=0)
-        view = Frame(k, k / 30.0, (exposed * (1.0 - 0.1 * (k // 2 % 2))).astype(np.uint8))
+        exposed = [room.image(T) for T in moments[4 * k : 4 * k + 3]]
+        view = Frame(k, k / 30.0, np.mean(exposed, axis=0).astype(np.uint8))
         odometry.follow(view)
         odometry.learn(view, room.depth_map(np.eye(4)))
     T = odometry.segments[0].T_world_camera

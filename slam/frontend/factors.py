@@ -51,12 +51,11 @@ def make_factors(drive: Drive, scale: Scale, level: int = logging.INFO) -> list[
     steps = network_steps(drive.trusted)
     calibration = calibrate_network(steps, [*geometric, *by_keyframes], scale.per_frame)
     logger.log(level, "pose network: %s", calibration.over(scale.per_frame))
-    by_network = network_factors(steps, calibration)
+    networks = network_factors(steps, calibration)
     if not calibration.is_measured:  # lengths in the wrong unit have no say beside measured ones
         by_geometry = {pose.ends for pose in geometric}
-        by_network = [
-            factor for factor in _outside(maps, by_network) if factor.ends not in by_geometry
-        ]
+        networks = [factor for factor in networks if factor.ends not in by_geometry]
+    by_network = _outside(maps, networks)
     by_image = _outside(maps, geometric)
     interpolated = _outside(maps, [scale.scaled(pose) for pose in drive.gap_steps])
     interpolated = join_gap_ends(

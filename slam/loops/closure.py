@@ -31,7 +31,7 @@ MOST_REJECTED = 200
 _LEAST_PATH_M = 15.0
 _LEAST_PATH_OVER_DEPTH = 0.75
 _LEAST_GAP_FRAMES = 30  # least distance of the two frames of a loop, frames
-_TRIED_FIRST = 3  # candidates of a view of which one must be verified before the others are tried
+_TRIED_FIRST = 4  # candidates of a view of which one must be verified before the others are tried
 _SAME_PLACE = 0.05  # of the least path of a loop: 0.75 m
 _BLOCK = 256
 # loops nearby that agree, by which one corrects the unit between two parts of a map as far as it will

@@ -27,7 +27,6 @@ logger = logging.getLogger(__name__)
 
 # keyframes that share so many tracks are in one place already
 _CONNECTED = 10
-_ASIDE = 0.26  # cosine of 75 degrees: keyframes of a map that look further apart have no loop
 _NEIGHBOURS = 3
 # a loop is wrong if fewer of its corners are one point after the adjustment
 _LEAST_KEPT = 0.5
@@ -139,7 +138,7 @@ class _Rows:
         return views
 
     def apart(self) -> BoolArray:
-        """Which keyframes share few tracks and may look at one place ``(K, K)``."""
+        """Which keyframes share few tracks ``(K, K)``."""
         first = np.cumsum([0, *(len(segment.points) for segment in self.segments)])
         tracks = [
             k.track_ids + first[number] for k, number in zip(self.keyframes, self.maps, strict=True)
@@ -147,9 +146,7 @@ class _Rows:
         of_row = np.repeat(np.arange(len(tracks)), [len(of_keyframe) for of_keyframe in tracks])
         shape = len(tracks), int(first[-1])
         seen = csr_array((np.ones(len(of_row)), (of_row, np.concatenate(tracks))), shape=shape)
-        looks = self.track.T_world_camera[:, :3, 2]
-        aside = (looks @ looks.T < _ASIDE) & np.equal.outer(self.maps, self.maps)
-        return ((seen @ seen.T).toarray() < _CONNECTED) & ~aside
+        return (seen @ seen.T).toarray() < _CONNECTED
 
     def joins(self, loops: Sequence[Loop]) -> tuple[TrackingEvent, ...]:
         """Each map after the first that loops join with an earlier one."""

@@ -49,6 +49,9 @@ class Sightings:
     depth: FloatArray
     depth_sigma: FloatArray
 
+    def __len__(self) -> int:
+        return len(self.camera)
+
 
 @dataclass(frozen=True)
 class Adjusted:
@@ -90,19 +93,21 @@ class BundleAdjustment:
         self._learned = np.isfinite(self._log_depth)
         self._log_depth[~self._learned] = 0.0
         # images of one point share the network's error
-        self._points = int(sightings.point.max(initial=-1)) + 1
-        times = np.bincount(sightings.point[self._learned], minlength=self._points)
+        times = np.bincount(
+            sightings.point[self._learned], minlength=int(sightings.point.max(initial=-1)) + 1
+        )
         self._depth_sigma = sightings.depth_sigma * np.sqrt(np.maximum(times[sightings.point], 1))
         self._column = np.where(free, np.cumsum(free) - 1, -1)
         self._free = free
+        self._points = int(sightings.point.max()) + 1 if len(sightings) else 0
         ends = np.searchsorted(sightings.camera, np.arange(len(free) + 1))
-        self._counts = np.diff(ends)
-        self._rows = [slice(*each) for each in pairwise(ends.tolist())]
-        self._learned_rows = np.flatnonzero(self._learned)
-        _, starts, self._image = np.unique(
-            sightings.camera[self._learned_rows], return_index=True, return_inverse=True
-        )
-        self._starts = starts[1:]
+        self._rows: list[slice] = []
+        self._learned_rows: list[NDArray[np.intp]] = []
+        for first, last in pairwise(ends.tolist()):
+            self._rows.append(slice(first, last))
+            learned = first + np.flatnonzero(self._learned[first:last])
+            if len(learned):
+                self._learned_rows.append(learned)
         self._blocks = self._eliminated_together()
 
     def solve(
@@ -167,12 +172,16 @@ class BundleAdjustment:
         It is where an adjustment of the images' units would end, so that derivatives need not know
         it.
         """
-        rows, image, whitened = self._learned_rows, self._image, np.zeros(len(logarithms))
-        if not len(rows):
+        whitened = np.zeros(len(logarithms))
+        if not self._learned_rows:
             return whitened
+        rows = np.concatenate(self._learned_rows)
+        image = np.repeat(
+            np.arange(len(self._learned_rows)), [len(each) for each in self._learned_rows]
+        )
         own, sigma = logarithms[rows], self._depth_sigma[rows]
         near, full = self._robust * sigma, sigma**-2
-        unit = np.array([median(each) for each in np.split(own, self._starts)])
+        unit = np.array([median(logarithms[each]) for each in self._learned_rows])
         for _ in range(_ROUNDS):
             weight = full * np.minimum(1.0, near / np.maximum(np.abs(own - unit[image]), 1e-9))
             unit = np.bincount(image, weight * own) / np.bincount(image, weight)
@@ -188,8 +197,10 @@ class BundleAdjustment:
         by_camera[:, :2] = pixel_jacobian(X, self._focal / self._pixel_sigma)
         scale = self._learned / (self._depth_sigma * np.maximum(X[:, 2], LEAST_DEPTH))
         by_camera[0, 2], by_camera[1, 2], by_camera[5, 2] = X[:, 1] * scale, -X[:, 0] * scale, scale
-        R = np.repeat(T_camera_world[:, :3, :3].T, self._counts, axis=2)  # of each sighting
-        return by_camera, sum(R[:, k, None] * by_camera[3 + k] for k in range(3))
+        by_point = np.empty((3, 3, len(X)))
+        for T, rows in zip(T_camera_world, self._rows, strict=True):
+            by_point[..., rows] = np.tensordot(T[:3, :3].T, by_camera[3:, :, rows], 1)
+        return by_camera, by_point
 
     def _in_cameras(self, T_camera_world: FloatArray, points: FloatArray) -> FloatArray:
         X = points[self._seen.point]
@@ -237,20 +248,19 @@ class BundleAdjustment:
             point_side[:, i] = -np.bincount(point, (B[i] * r).sum(axis=0), points)
             for j in range(i + 1):
                 V[:, i, j] = V[:, j, i] = np.bincount(point, (B[i] * B[j]).sum(axis=0), points)
-        W = sum(A[:, None, k] * B[:, k] for k in range(3))
+        W = A[:, None, 0] * B[:, 0] + A[:, None, 1] * B[:, 1] + A[:, None, 2] * B[:, 2]
 
         def step(damping: float) -> tuple[FloatArray, FloatArray] | None:
-            # of symmetric 3x3 by cofactors, points last: LAPACK takes three times as long
-            damped = _damped(V, damping).T
-            cofactors = np.cross(damped[[1, 2, 0]], damped[[2, 0, 1]], axis=1)
-            V_inverse = cofactors / (damped[0] * cofactors[0]).sum(axis=0)
+            V_inverse = np.asarray(np.linalg.inv(_damped(V, damping)), np.float64)
             # the cameras' system without the points, as a sum of parts
             side, by_point = camera_side.copy(), point_side.copy()
             parts = [(np.array([k]), own) for k, own in enumerate(_damped(U, damping))]
             coupled = []
             for block in self._blocks:
-                coupling = np.take(W, block.sightings, 2)  # in order, which indexing is not
-                inverse = V_inverse.take(block.points[block.local_point], 2)
+                coupling = W[..., block.sightings]
+                inverse = np.ascontiguousarray(
+                    V_inverse[block.points[block.local_point]].transpose(1, 2, 0)
+                )
                 # row by row: products of small matrices one by one take ten times as long
                 with_points = sum(coupling[:, i, None] * inverse[i] for i in range(3))
                 W_block = block.dense(coupling)
@@ -266,7 +276,7 @@ class BundleAdjustment:
                 by_point[block.points] -= (by_camera[block.cameras].ravel() @ W_block).reshape(
                     -1, 3
                 )
-            return by_camera, (V_inverse * by_point.T).sum(axis=1).T
+            return by_camera, np.einsum("pij,pj->pi", V_inverse, by_point)
 
         return step
 

@@ -294,8 +294,7 @@ class LocalMap:
             for row in range(len(chosen))
         ]
         for k, tracks, T in zip(chosen, gone, solved.T_camera_world, strict=True):
-            keyframe = self.keyframes[k].without(tracks) if len(tracks) else self.keyframes[k]
-            self.keyframes[k] = replace(keyframe, T_camera_world=T)
+            self.keyframes[k] = replace(self.keyframes[k].without(tracks), T_camera_world=T)
         dead = track_ids[np.bincount(sightings.point[~bad], minlength=len(track_ids)) < 2]
         self.points[dead] = np.nan
         return gone, dead

@@ -149,7 +149,7 @@ def _part_before(part_of: NDArray[np.intp]) -> NDArray[np.intp]:
 
 def _pace(keyframes: Sequence[TrackedKeyframe], tied: NDArray[np.bool_]) -> float:
     """The median way of the camera a frame between keyframes that points tie; 0 without any."""
-    centres = LocalMap([*keyframes]).T_world_camera[:, :3, 3]
+    centres = invert(np.array([keyframe.T_camera_world for keyframe in keyframes]))[:, :3, 3]
     frames = np.diff([keyframe.index for keyframe in keyframes])
     paces = np.linalg.norm(np.diff(centres, axis=0), axis=1)[tied] / frames[tied]
     return median(paces) if len(paces) else 0.0

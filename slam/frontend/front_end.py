@@ -119,16 +119,16 @@ class MotionTracker:
         if self._alone is None or not self._alone.segments:
             return None
         segment = self._alone.segments[-1]
-        located: list[tuple[int, FloatArray]] = []
-        for each in segment.frames[-_FRAMES:]:
-            T_frame_map = segment.T_camera_world(each)
-            if each.index <= index and T_frame_map is not None:
-                located.append((each.index, T_frame_map))
-        if len(located) < 2 or located[-1][0] != index:
+        located = [
+            each
+            for each in segment.frames[-_FRAMES:]
+            if each.index <= index and each.T_camera_keyframe is not None
+        ]
+        if len(located) < 2 or located[-1].index != index:
             return None
-        (before, T_before_map), (_, T_frame_map) = located[-2:]
+        T_before_map, T_frame_map = map(segment.T_camera_world, located[-2:])
         unit = learned_unit(LocalMap(segment.keyframes[-_KEYFRAMES:], segment.points))
-        return before, in_unit(T_before_map @ invert(T_frame_map), unit)
+        return located[-2].index, in_unit(T_before_map @ invert(T_frame_map), unit)
 
     def finish(self) -> Measured:
         """All that was measured so far, which stays while more frames follow.

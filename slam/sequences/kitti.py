@@ -79,9 +79,11 @@ def _open_odometry(root: OdometryRoot, name: str, asked: Path | None) -> Recorde
         ),
         usual_height_m=kitti.CAMERA_HEIGHT_M if simulated is None or asked is not None else None,
         T_camera_lidar=T_camera_lidar,
-        scans=_readers(kitti.read_velodyne, folder / "velodyne", files),
-        depth_maps=_readers(read_depth_map, folder / f"depth_{number}", files),
-        distance_to_surface=_distance_to_mesh(root.base / "mesh.ply"),
+        scans=_readers(kitti.read_velodyne, folder / "velodyne", "*.bin", files),
+        depth_maps=_readers(read_depth_map, folder / f"depth_{number}", "*.png", files),
+        distance_to_surface=None
+        if simulated is None
+        else _distance_to_mesh(root.base / "mesh.ply"),
     )
 
 
@@ -111,8 +113,10 @@ def _open_raw(drive: Path, asked: Path | None) -> RecordedSequence:
         T_any_camera=_oxts_poses(drive, files, stamps, known, T_camera_lidar),
         usual_height_m=kitti.CAMERA_HEIGHT_M,
         T_camera_lidar=T_camera_lidar,
-        scans=_readers(kitti.read_velodyne, drive / "velodyne_points/data", files),
-        depth_maps=_readers(read_depth_map, drive / _DEPTH_MAPS / f"image_{number}", files),
+        scans=_readers(kitti.read_velodyne, drive / "velodyne_points/data", "*.bin", files),
+        depth_maps=_readers(
+            read_depth_map, drive / _DEPTH_MAPS / f"image_{number}", "*.png", files
+        ),
     )
 
 
@@ -197,7 +201,7 @@ def _oxts_poses(
     if not path.exists():
         logger.warning("no %s: the drive has no reference poses", path)
         return None
-    packets = _readers(kitti.read_packet, folder, files)
+    packets = _readers(kitti.read_packet, folder, "*.txt", files)
     if not packets.keys() >= set(files.rows):
         raise SequenceError(
             f"{folder} has {len(packets)} packets for {len(files.paths)} images: restore what is missing, or remove "
@@ -242,10 +246,10 @@ def T_world_imu(packets: FloatArray, ages_s: FloatArray) -> FloatArray:
 
 
 def _readers(
-    read: Callable[[Path], FloatArray], folder: Path, files: NumberedFiles
+    read: Callable[[Path], FloatArray], folder: Path, pattern: str, files: NumberedFiles
 ) -> dict[int, ArrayReader]:
     """Readers of the files of a folder by frame, by the numbers of the images."""
-    paths = (path for path in folder.glob("*") if path.stem.isdecimal())
+    paths = (path for path in folder.glob(pattern) if path.stem.isdecimal())
     return {int(path.stem) - files.first: partial(read, path) for path in paths}
 
 

@@ -173,10 +173,9 @@ class LocalMap:
         """The row of the last keyframe up to a frame."""
         return bisect_right(self.keyframes, index, key=lambda keyframe: keyframe.index) - 1
 
-    def T_camera_world(self, frame: TrackedFrame) -> FloatArray | None:
-        """The pose of a frame, wherever adjustments moved its keyframe; None where it was lost."""
-        if frame.T_camera_keyframe is None:
-            return None
+    def T_camera_world(self, frame: TrackedFrame) -> FloatArray:
+        """The pose of a frame that was located, wherever adjustments moved its keyframe."""
+        assert frame.T_camera_keyframe is not None
         keyframe = self.keyframes[self.row_before(frame.index)]
         return compose(frame.T_camera_keyframe, keyframe.T_camera_world)
 

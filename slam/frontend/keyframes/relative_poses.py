@@ -144,9 +144,9 @@ def _segment_poses(segment: LocalMap, intrinsics: Intrinsics, seed: int) -> list
             T_guess = T_of[frame.index]
             continue
         pixels = frame.pixels.astype(np.float64)
-        followed = segment.T_camera_world(frame)
-        guess = T_guess if followed is None else followed
-        located = _seen_from(segment, frame.track_ids, pixels, guess, intrinsics, seed)
+        if frame.T_camera_keyframe is not None:
+            T_guess = segment.T_camera_world(frame)
+        located = _seen_from(segment, frame.track_ids, pixels, T_guess, intrinsics, seed)
         if located is not None:
             T_guess, sigmas = located
             nearest = keyframes[segment.row_before(frame.index)]

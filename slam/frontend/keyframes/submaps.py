@@ -29,7 +29,7 @@ from slam.frontend.keyframes.local_map import (
 from slam.frontend.keyframes.units import learned_units
 from slam.geometry.multiview import MIN_POINTS
 from slam.geometry.robust import median
-from slam.geometry.se3 import FloatArray, apply, chain, compose, invert, length_of, make
+from slam.geometry.se3 import FloatArray, apply, chain, compose, in_unit, invert, length_of
 
 logger = logging.getLogger(__name__)
 
@@ -272,7 +272,7 @@ def moved(segment: LocalMap, T_world_camera: FloatArray, scales: FloatArray) -> 
     for frame in segment.frames:
         T = frame.T_camera_keyframe
         if T is not None:
-            T = make(T[:3, :3], scales[segment.row_before(frame.index)] * T[:3, 3])
+            T = in_unit(T, scales[segment.row_before(frame.index)])
         frames.append(replace(frame, T_camera_keyframe=T))
     return LocalMap(keyframes, points, frames, segment.started, segment.turns)
 

@@ -12,8 +12,6 @@ from torch import Tensor, nn
 # paper's largest layer (7 x 7 on 32 channels, 208 x 64, batch 4) take 1.6 s so, 6 s in one piece.
 _CPU_CHUNK = 2**20
 
-_LARGE = 2**20  # sampled values of a layer
-
 
 def deform_conv2d(
     input: Tensor, offset: Tensor, weight: Tensor, mask: Tensor, stride: int, padding: int
@@ -45,7 +43,7 @@ def deform_conv2d(
     grid = _sampling_grid(offset, rows, columns, (size[0], size[1]))
     maps, factors = input.to(grid.dtype), mask.to(grid.dtype).reshape(batch, 1, taps, -1)
     images, places = batch, out_h * out_w
-    if input.device.type == "cpu":
+    if input.device.type == "cpu" and not torch.jit.is_tracing():  # a graph has one piece
         places = max(1, min(places, _CPU_CHUNK // (channels * taps)))
         images = max(1, min(batch, _CPU_CHUNK // (channels * taps * places)))
     split = [torch.split(tensor, images) for tensor in (maps, grid, factors)]
@@ -88,25 +86,6 @@ class DeformableConv2d(nn.Module):
             self.stride,
             self.padding,
         )
-
-
-@torch.inference_mode()
-def has_large_sampling(network: nn.Module, *inputs: Tensor | list[Tensor]) -> bool:
-    """Whether any deformable layer of a network samples so many values that its ONNX graph takes minutes to make."""
-    sampled = [0]
-
-    def look(layer: nn.Module, _: object, output: Tensor) -> None:
-        assert isinstance(layer, DeformableConv2d)
-        sampled.append(output[:, 0].numel() * layer.kernel.weight[0].numel())
-
-    layers = [layer for layer in network.modules() if isinstance(layer, DeformableConv2d)]
-    hooks = [layer.register_forward_hook(look) for layer in layers]
-    try:
-        network(*inputs)
-    finally:
-        for hook in hooks:
-            hook.remove()
-    return max(sampled) > _LARGE
 
 
 def _resting_places(out: int, kernel: int, stride: int, padding: int, like: Tensor) -> Tensor:

@@ -35,8 +35,7 @@ logger = logging.getLogger(__name__)
 class OnnxGraph:
     """A network that is exported at its first call with inputs of each size and run by ONNX Runtime from then on.
 
-    Outputs equal the network's up to rounding. A network with large deformable layers stays as it is: its graph takes
-    minutes to make.
+    Outputs equal the network's up to rounding.
     """
 
     def __init__(self, network: Callable[[], nn.Module], threads: int, identity: str) -> None:
@@ -58,14 +57,9 @@ class OnnxGraph:
         if key not in self._infer:
             graph = kept(key)
             if graph is None:
-                from erfsfm.networks.deformable import has_large_sampling
-                from erfsfm.networks.torch_network import TorchNetwork, exported, tensors
+                from erfsfm.networks.torch_network import exported, tensors
 
-                network, example = self._network(), tensors(inputs)
-                if has_large_sampling(network, *example):
-                    self._infer[key] = TorchNetwork(network, "cpu")
-                    return self._infer[key](*inputs)
-                graph = exported(network, example)
+                graph = exported(self._network(), tensors(inputs))
                 keep(key, graph)
             self._infer[key] = partial(_run, open_session(graph, self._threads))
         return self._infer[key](*inputs)

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from erfsfm.networks import deformable, onnx_graph
+from erfsfm.networks import onnx_graph
 from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.onnx_graph import Array, OnnxGraph, folder, keep, kept
 from erfsfm.networks.presets import build
@@ -51,10 +51,7 @@ SLOW = ("erf-depthnet-dilated", "erf-depthnet-dfcv2", "erf-posenet-dfc", "erf-po
     + [pytest.param(name, marks=pytest.mark.slow) for name in SLOW],
 )
 @torch.inference_mode()
-def test_a_graph_has_the_outputs_of_its_network_on_other_images_too(
-    name: str, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(deformable, "_LARGE", 2**40)  # all in plain PyTorch
+def test_a_graph_has_the_outputs_of_its_network_on_other_images_too(name: str):
     kind = "depth" if "depth" in name else "pose"
     network = with_moving_taps(build(name, width=0.125, sources=4))
     given = [inputs(kind, seed) for seed in range(3)]
@@ -65,17 +62,6 @@ def test_a_graph_has_the_outputs_of_its_network_on_other_images_too(
     before = len(calls)
     graph(*given[0])
     assert len(calls) == before, "PyTorch computes what ONNX Runtime should"
-
-
-@torch.inference_mode()
-def test_networks_with_large_deformable_layers_are_not_exported(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(deformable, "_LARGE", 1)
-    network = with_moving_taps(build("erf-depthnet-dfc", width=0.25))
-    graph, calls = OnnxGraph(lambda: network, 1, "a network"), calls_of(network)
-    graph(*inputs("depth", 0))
-    before = len(calls)
-    graph(*inputs("depth", 0))
-    assert len(calls) == before + 1
 
 
 NO_CODE = shutil.ignore_patterns("weights", "__pycache__")

@@ -43,7 +43,7 @@ def deform_conv2d(
     grid = _sampling_grid(offset, rows, columns, (size[0], size[1]))
     maps, factors = input.to(grid.dtype), mask.to(grid.dtype).reshape(batch, 1, taps, -1)
     images, places = batch, out_h * out_w
-    if input.device.type == "cpu" and not torch.jit.is_tracing():  # a graph has one piece
+    if input.device.type == "cpu" and not torch.onnx.is_in_onnx_export():  # a graph has one piece
         places = max(1, min(places, _CPU_CHUNK // (channels * taps)))
         images = max(1, min(batch, _CPU_CHUNK // (channels * taps * places)))
     split = [torch.split(tensor, images) for tensor in (maps, grid, factors)]

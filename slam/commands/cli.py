@@ -361,9 +361,7 @@ def simulate(
         SimulationOptions(route, frames, seed, width, height, named, varied, motion, rate)
     )
     with progress_bar() as progress:
-        write_kitti_root(
-            world, output, depth, lidar, lambda done: progress("frames", done, frames), mesh
-        )
+        write_kitti_root(world, output, depth, lidar, progress, mesh)
     typer.echo(f"{frames} frames in {output}: erfsfm-slam run --dataset {output} --sequence sim")
 
 

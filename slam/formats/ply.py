@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ _NAMES = {kind: name for name, kind in _TYPES.items()}
 _AXES, _NORMALS, _COLOURS = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 # x right, y ahead, z up
 R_UP_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+_END = b"end_header\n"
 _TRIANGLE = np.dtype([("count", "u1"), ("vertices", "<u4", (3,))])
 
 
@@ -63,53 +64,37 @@ def read_ply(path: Path) -> Ply:
     Raises:
         RunError: it is no PLY in little-endian form, is cut short, or holds impossible values.
     """
-    parts = _mapped(path)
-    vertices, faces = parts["vertex"], parts.get("face")
-    ply = Ply(np.array(vertices), None if faces is None else faces["vertices"].astype(np.int64))
-    points, triangles = ply.columns(_AXES), ply.triangles
-    wrong = ""
-    if points is None:
-        wrong = "its vertices have no x, y, z"
-    elif not np.isfinite(points).all():
-        wrong = "a coordinate is not finite"
-    elif faces is not None and (faces["count"] != 3).any():
-        wrong = "a face has other than 3 vertices"
-    elif (
-        triangles is not None
-        and triangles.size
-        and not 0 <= triangles.min() <= triangles.max() < len(points)
-    ):
-        wrong = "a triangle has a vertex that does not exist"
-    if wrong:
-        raise RunError(f"{path} is no PLY that can be read ({wrong}): run the sequence again")
-    return ply
-
-
-def _mapped(path: Path) -> dict[str, NDArray[np.void]]:
-    """The elements by name, vertices among them."""
-    parts: dict[str, NDArray[np.void]] = {}
     try:
-        with path.open("rb") as file:
-            if file.readline() != b"ply\n":
-                raise ValueError("it does not begin with 'ply'")
-            elements, place = _header(file), file.tell()
-        size = path.stat().st_size
-        for name, (count, fields) in elements.items():
-            dtype, start = np.dtype(fields), place
-            place += count * dtype.itemsize
-            if not start <= place <= size:
-                raise ValueError(f"it announces {count} elements '{name}', more than it holds")
-            parts[name] = (
-                np.memmap(path, dtype, "r", start, (count,)) if count else np.empty(0, dtype)
-            )
-        corners = parts["face"].dtype.names if "face" in parts else ("vertices",)
-        if place < size or "vertex" not in parts or "vertices" not in (corners or ()):
-            raise ValueError("it is longer than its header states, or has no vertices")
-        return parts
+        return _checked(path.read_bytes())
     except (OSError, ValueError, KeyError) as error:
         raise RunError(
             f"{path} is no PLY that can be read ({error}): run the sequence again"
         ) from error
+
+
+def _checked(content: bytes) -> Ply:
+    """What a file holds; ``ValueError`` or ``KeyError`` where that is not what its header says."""
+    place = content.find(_END) + len(_END)
+    if not content.startswith(b"ply\n") or place < len(_END):
+        raise ValueError("it does not begin with 'ply', or ends within its header")
+    parts: dict[str, NDArray[np.void]] = {}
+    for name, (count, fields) in _elements(content[:place].decode("ascii")).items():
+        parts[name] = np.frombuffer(content, np.dtype(fields), count, place)
+        place += parts[name].nbytes
+    if place < len(content) or "vertex" not in parts:
+        raise ValueError("it is longer than its header states, or has no vertices")
+    faces = parts.get("face")
+    ply = Ply(parts["vertex"], None if faces is None else faces["vertices"].astype(np.int64))
+    points, triangles = ply.columns(_AXES), ply.triangles
+    if points is None:
+        raise ValueError("its vertices have no x, y, z")
+    if not np.isfinite(points).all():
+        raise ValueError("a coordinate is not finite")
+    if faces is not None and (faces["count"] != 3).any():
+        raise ValueError("a face has other than 3 vertices")
+    if triangles is not None and ((triangles < 0) | (triangles >= len(points))).any():
+        raise ValueError("a triangle has a vertex that does not exist")
+    return ply
 
 
 def rotated(ply: Ply, R_up_world: FloatArray) -> Ply:
@@ -172,14 +157,12 @@ def write_ply_pieces(
     write_atomically(path, fill, RunError)
 
 
-def _header(file: BinaryIO) -> dict[str, tuple[int, list[tuple[Any, ...]]]]:
+def _elements(header: str) -> dict[str, tuple[int, list[tuple[Any, ...]]]]:
     """Count and fields of the elements by name; of a list as many values as a triangle has corners."""
     elements: dict[str, tuple[int, list[tuple[Any, ...]]]] = {}
     fields: list[tuple[Any, ...]] = []
-    for line in file:
-        match line.decode("ascii").split():
-            case ["end_header"]:
-                return elements
+    for line in header.splitlines():
+        match line.split():
             case ["format", form, _] if form != "binary_little_endian":
                 raise ValueError(f"its format is {form}")
             case ["element", name, count]:
@@ -189,7 +172,7 @@ def _header(file: BinaryIO) -> dict[str, tuple[int, list[tuple[Any, ...]]]]:
                 fields += [("count", f"<{_TYPES[count]}"), ("vertices", f"<{_TYPES[corner]}", (3,))]
             case ["property", kind, name]:
                 fields.append((name, f"<{_TYPES[kind]}"))
-    raise ValueError("it ends within its header")
+    return elements
 
 
 def scene_of(vertices: NDArray[np.float32], triangles: NDArray[np.uint32]) -> Any:

@@ -1,7 +1,6 @@
 """Triangle meshes with materials, and the terrain that the streets of a plan are bent onto."""
 
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,39 +14,6 @@ IntArray = NDArray[np.int64]
 PARAMETERS = 6  # of a texture
 # fields of a mesh whose last axis is that of its triangles
 _OF_TRIANGLES = ("uv", "normals", "tangents", "instance", "material")
-
-# of a surface; selects its texture
-Material = Literal[
-    "asphalt",
-    "junction",
-    "pavement",
-    "kerb",
-    "grass",
-    "gravel",
-    "wall",
-    "roof",
-    "bark",
-    "leaves",
-    "metal",
-    "sign",
-    "paint",
-    "glass",
-    "tyre",
-    "fence",
-    "plaster",
-    "tiles",
-    "boards",
-    "carpet",
-    "wood",
-    "fabric",
-    "books",
-    "picture",
-    "screen",
-    "pane",
-    "carton",
-    "lamp",
-]
-MATERIALS: tuple[Material, ...] = get_args(Material)
 
 
 @dataclass(frozen=True)
@@ -64,7 +30,7 @@ class Mesh:
     normals: Float32Array  # unit normals, (3, T)
     tangents: Float32Array  # unit direction in which u grows, (3, T)
     instance: NDArray[np.int32]  # index into the tables below, (T,)
-    material: NDArray[np.int8]  # of each triangle, a row of MATERIALS, (T,)
+    material: NDArray[np.int8]  # of each triangle, a row of `world.MATERIALS`, (T,)
     colours: Float32Array  # two base colours per instance, RGB in [0, 1], (2, 3, I)
     parameters: Float32Array  # of the material's texture, (PARAMETERS, I)
     offsets: Float32Array  # of an instance in the noise texture, (2, I)

@@ -5,10 +5,10 @@ import functools
 import numpy as np
 
 from slam.runtime.imports import import_open3d
-from slam.simulation.geometry import MATERIALS, Float32Array, FloatArray, IntArray, luck, unit
+from slam.simulation.geometry import Float32Array, FloatArray, IntArray, luck, unit
 from slam.simulation.interior import interior_of
 from slam.simulation.room_textures import GLOWING
-from slam.simulation.world import Surface
+from slam.simulation.world import MATERIALS, Surface
 
 _RAYS = 48  # around a corner
 _BOUNCES = 3

@@ -15,14 +15,12 @@ _MOST_PIXELS = 2**25
 _READOUT_S = 0.025  # of a rolling shutter, where frames are far enough apart
 _RATES = (5.0, 60.0)
 
-RouteKind = Literal["loop", "grid", "straight"]
 Motion = Literal["walk", "look", "phone", "drone", "robot", "turn"]
 Hazard = Literal["moving-cars", "exposure", "blur", "stop", "rain"]
 RoomHazard = Literal["people", "exposure", "blur", "rolling-shutter", "stop"]
 StreetKind = Literal["town", "avenue", "country", "motorway"]
-WORLD_KINDS: tuple[str, ...] = (*get_args(RouteKind), "rooms")
-_STREET_KINDS: tuple[StreetKind, ...] = ("town", "avenue", "country", "motorway")
-_STREET_SHARES = (0.3, 0.15, 0.35, 0.2)
+_ROUTES = ("loop", "grid", "straight", "rooms")
+_STREET_SHARES = (0.3, 0.15, 0.35, 0.2)  # of the kinds
 
 
 @dataclass(frozen=True)
@@ -32,8 +30,7 @@ class SimulationOptions:
     A ``varied`` street is a town's, an avenue, a country road or a motorway (`Variety`) with
     another camera than KITTI's, hills, hard light, fences and people, and cars that overtake if
     any move; ``varied`` rooms have another focal length. ``rate``, frames a second, and ``motion``
-    are of rooms. ``fov_deg`` is the horizontal field of view of square pixels; None is that of the
-    world's own camera.
+    are of rooms.
     """
 
     route: str = "loop"
@@ -45,7 +42,6 @@ class SimulationOptions:
     varied: bool = False
     motion: str | None = None
     rate: float = STREET_RATE
-    fov_deg: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse invalid options.
@@ -53,10 +49,8 @@ class SimulationOptions:
         Raises:
             SequenceError: names the first option that is invalid, and what it may be.
         """
-        if self.route not in WORLD_KINDS:
-            raise SequenceError(
-                f"route must be one of {', '.join(WORLD_KINDS)}; got {self.route!r}"
-            )
+        if self.route not in _ROUTES:
+            raise SequenceError(f"route must be one of {', '.join(_ROUTES)}; got {self.route!r}")
         place, known = (
             ("rooms", get_args(RoomHazard))
             if self.route == "rooms"
@@ -142,7 +136,7 @@ USUAL = Variety(
 def draw_variety(seed: int, lone_road: bool) -> Variety:
     """The variety of a seed; only a lone road is a motorway."""
     rng = np.random.default_rng([seed, 5])
-    kind = _STREET_KINDS[rng.choice(4, p=_STREET_SHARES)]
+    kind: StreetKind = get_args(StreetKind)[rng.choice(4, p=_STREET_SHARES)]
     lowest, highest = (0.5, 2.5) if rng.random() < 0.5 else (1.2, 2.0)
     height_m = float(np.exp(rng.uniform(np.log(lowest), np.log(highest))))
     return Variety(

@@ -3,7 +3,6 @@
 import json
 import shutil
 import tempfile
-from collections.abc import Callable
 from dataclasses import asdict
 from functools import lru_cache, partial
 from pathlib import Path
@@ -12,9 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.common.progress import Progress, silent
+from erfsfm.common.readers.camera_file import CameraFile, Pinhole
 from slam.formats.ply import write_ply
 from slam.formats.trajectory import Trajectory, write_kitti
 from slam.runtime.errors import SequenceError
+from slam.sequences.camera_file import write_camera
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.images import ReadImages
 from slam.sequences.recording import RecordedSequence, Source, frame_range, uniform_stamps
@@ -92,7 +94,7 @@ def write_kitti_root(
     output: Path,
     depth: bool = False,
     lidar: bool = False,
-    progress: Callable[[int], None] | None = None,
+    progress: Progress = silent,
     mesh: bool = False,
 ) -> None:
     """Write a drive as the KITTI odometry root ``output`` with the one sequence ``sim``.
@@ -102,7 +104,7 @@ def write_kitti_root(
         output: a folder that does not exist yet or is empty.
         depth: whether to write depth maps (16 bit, metres x 256, 0 where nothing was hit).
         lidar: whether to write scans.
-        progress: called with the number of frames written so far.
+        progress: is told how many frames are written.
         mesh: whether to write all surfaces that stand still, as ``mesh.ply`` in the frame of the
             first camera.
 
@@ -136,11 +138,7 @@ def write_kitti_root(
 
 
 def _write_frames(
-    world: SimulatedWorld,
-    folder: Path,
-    depth: bool,
-    lidar: bool,
-    progress: Callable[[int], None] | None,
+    world: SimulatedWorld, folder: Path, depth: bool, lidar: bool, progress: Progress
 ) -> None:
     """Images, and depth maps and scans if wanted."""
     for name in ["image_2"] + ["depth_2"] * depth + ["velodyne"] * lidar:
@@ -152,8 +150,7 @@ def _write_frames(
             _write_png(folder / "depth_2" / f"{index:06d}.png", units.astype(np.uint16))
         if lidar:
             world.scan(index).astype("<f4").tofile(folder / "velodyne" / f"{index:06d}.bin")
-        if progress:
-            progress(index + 1)
+        progress("frames", index + 1, len(world))
 
 
 def _write_records(world: SimulatedWorld, root: Path) -> None:
@@ -171,14 +168,13 @@ def _write_records(world: SimulatedWorld, root: Path) -> None:
     (root / "poses").mkdir()
     stamps = np.arange(len(world), dtype=np.float64)
     write_kitti(root / "poses" / "sim.txt", Trajectory(stamps, world.T_world_camera))
-    keys = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
-    keys["fps"] = options.rate
-    if world.camera_height_m is not None:
-        keys["camera_height_m"] = world.camera_height_m
-    if options.readout_s:
-        keys["readout_ms"] = 1e3 * options.readout_s
-    keys["model"] = "pinhole"
-    write_lines(root / "camera.yaml", [f"{key}: {value}" for key, value in keys.items()])
+    lens = CameraFile(
+        **vars(Pinhole.of(camera)),
+        fps=options.rate,
+        camera_height_m=world.camera_height_m,
+        readout_ms=1e3 * options.readout_s,
+    )
+    write_camera(root, lens, None)
     record = {**asdict(options), "version": VERSION}
     write_lines(root / "simulation.json", [json.dumps(record, indent=2)])
 

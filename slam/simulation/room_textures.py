@@ -2,11 +2,10 @@
 
 import numpy as np
 
-from slam.simulation.geometry import Material
 from slam.simulation.texture import Lengths, Shader, Texels, cell_hash, grained, mix, slabs
 
 # light of their own
-GLOWING: dict[Material, float] = {"screen": 1.3, "pane": 2.2, "lamp": 2.5}
+GLOWING: dict[str, float] = {"screen": 1.3, "pane": 2.2, "lamp": 2.5}
 
 
 def _plaster(texels: Texels) -> Lengths:
@@ -91,7 +90,7 @@ def _carton(texels: Texels) -> Lengths:
     return rgb * (1.0 - 0.35 * texels.rim(0.008))
 
 
-ROOM_SHADERS: dict[Material, Shader] = {
+ROOM_SHADERS: dict[str, Shader] = {
     "plaster": _plaster,
     "tiles": slabs(0.07, (0.5, 0.4, 0.03), (0.06, 0.05, 0.03)),
     "boards": _boards,

@@ -2,30 +2,25 @@
 
 import functools
 
+import cv2
 import numpy as np
 
+from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.simulation.carried import Carried, Floor
-from slam.simulation.geometry import MATERIALS, Float32Array, FloatArray, Mesh, luck
+from slam.simulation.geometry import Float32Array, FloatArray, Mesh, luck
 from slam.simulation.interior import interior_of
 from slam.simulation.irradiance import irradiance_of
 from slam.simulation.objects import person
 from slam.simulation.options import SimulationOptions
 from slam.simulation.room_textures import GLOWING
 from slam.simulation.shapes import things
-from slam.simulation.world import (
-    Hits,
-    SimulatedWorld,
-    Surface,
-    between,
-    place_rays,
-    square_camera,
-    through_lens,
-)
+from slam.simulation.world import MATERIALS, Hits, SimulatedWorld, Surface, between, place_rays
 
 STILL_S = 3.0
 _USUAL_FOV_DEG = 65.0
 _VARIED_FOV_DEG = (55.0, 100.0)
+_BLUR_PX = 0.55  # of the lens, standard deviation
 _PEOPLE = 6  # the first of them walks ahead of the camera
 _AHEAD_S = 3.5  # by this time
 _NEAREST_M = 0.7  # of a person to the camera, below which the person is left out
@@ -57,12 +52,13 @@ class SimulatedRooms(SimulatedWorld):
         rng = luck(options.seed, 57)
         # around their own origins, looking along x
         self._people = things(rng, [person] * _PEOPLE) if peopled else []
-        fov = options.fov_deg or _USUAL_FOV_DEG
-        if options.varied and options.fov_deg is None:
-            fov = float(np.exp(luck(options.seed, 55).uniform(*np.log(_VARIED_FOV_DEG))))
-        seconds_of_frames = np.arange(options.frames) / options.rate
-        camera = square_camera(options.width, options.height, fov)
-        super().__init__(options, camera, self._poses(seconds_of_frames))
+        fov_deg, width, height = _USUAL_FOV_DEG, options.width, options.height
+        if options.varied:
+            fov_deg = np.exp(luck(options.seed, 55).uniform(*np.log(_VARIED_FOV_DEG)))
+        focal_px = float(0.5 * width / np.tan(0.5 * np.deg2rad(fov_deg)))
+        centre = 0.5 * (width - 1), 0.5 * (height - 1)
+        camera = Intrinsics(width, height, focal_px, focal_px, *centre)
+        super().__init__(options, camera, self._poses(np.arange(options.frames) / options.rate))
 
     def _build(self) -> Mesh:
         return self._interior.mesh
@@ -108,7 +104,7 @@ class SimulatedRooms(SimulatedWorld):
     def _develop(self, rgb: Float32Array, index: int) -> Float32Array:
         """Gain, lens blur and noise."""
         gain = self._gain(index)
-        rgb = through_lens(rgb * np.float32(gain))
+        rgb = cv2.GaussianBlur(rgb * np.float32(gain), (3, 3), _BLUR_PX)
         if "exposure" in self.options.hazards:
             rng = luck(self.options.seed, 56, index)
             rgb = rgb + rng.standard_normal(rgb.shape, dtype=np.float32) * np.float32(

@@ -50,9 +50,11 @@ class StreetPlan:
     drive: tuple[Node, ...]  # nodes in the order in which the camera passes them
     kind: StreetKind = "town"  # of streets and what stands beside them
 
-    def node(self, node: Node) -> FloatArray:
-        """Plan position of a node, ``(2,)``."""
-        return np.array([self.xs[node[0]], self.ys[node[1]]])
+    @property
+    def driven(self) -> FloatArray:
+        """Plan positions of the nodes of the drive ``(n, 2)``."""
+        i, j = np.transpose(self.drive)
+        return np.stack([self.xs[i], self.ys[j]], axis=1)
 
     def is_street(self, a: Node, b: Node) -> bool:
         """Whether two neighbouring nodes are joined by a street."""
@@ -283,7 +285,7 @@ def _layout(
         cycle = loop_cycle(rng, edges)
         plan = town_plan(rng, cycle + cycle + cycle[:1], spacing, side_streets=0.35, kind=kind)
         # around a cycle that is driven twice, cut off ``OVERLAP`` metres after its start is met
-        first, second = plan.node(plan.drive[0]), plan.node(plan.drive[1])
+        first, second = plan.driven[:2]
         lane_plan = _lane(plan, seed)[int(0.5 * np.linalg.norm(second - first) / STEP) :]
         away = np.linalg.norm(lane_plan - lane_plan[0], axis=1)
         met = int(60.0 / STEP)
@@ -305,7 +307,7 @@ def _lane_offset(plan: StreetPlan, seed: int) -> float:
 def _lane(plan: StreetPlan, seed: int) -> FloatArray:
     """The whole driven path ``(M, 2)``: right-hand lane, rounded corners and a little drift."""
     rng = luck(seed, 3)
-    nodes = np.stack([plan.node(node) for node in plan.drive])  # (n, 2)
+    nodes = plan.driven
     offset = _lane_offset(plan, seed)
     ahead = unit(np.diff(nodes, axis=0))
     right = np.stack([ahead[:, 1], -ahead[:, 0]], axis=1)

@@ -14,16 +14,15 @@ from erfsfm.common.config_tree import parse_yaml
 from erfsfm.common.files import read_text
 from slam.simulation.geometry import (
     FLAT,
-    MATERIALS,
     PARAMETERS,
     Bend,
     Float32Array,
     FloatArray,
     IntArray,
-    Material,
     Mesh,
     unit,
 )
+from slam.simulation.world import MATERIALS
 
 Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1
 
@@ -87,12 +86,6 @@ class Site:
         length = y1 - y0 if number % 2 else x1 - x0
         return self.moved(x, y, turn=number * np.pi / 2.0), length
 
-    def drawn_by(self, rng: np.random.Generator) -> "Site":
-        """The place with other luck."""
-        site = copy.copy(self)
-        site.rng = rng
-        return site
-
     def colour(self, thing: str) -> FloatArray:
         """One of the colours that a thing of ``colours.yaml`` may have, a little off, ``(3,)``."""
         spread, colours = itemgetter("spread", "colours")(_palettes()[thing])
@@ -102,7 +95,7 @@ class Site:
 
     def instance(
         self,
-        material: Material,
+        material: str,
         colour: ArrayLike,
         second: ArrayLike = 1.0,
         parameters: tuple[float, ...] = (),
@@ -110,7 +103,7 @@ class Site:
         """Register an instance with its colours and parameters; return its number.
 
         Args:
-            material: selects its texture.
+            material: one of `MATERIALS`, whose texture it has.
             colour: RGB in [0, 1], ``(3,)``, or the name of a thing whose `colour` is drawn.
             second: the same of the texture's second colour, or a share of the first.
             parameters: of the texture.

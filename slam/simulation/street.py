@@ -18,7 +18,7 @@ from slam.simulation.route import STEP, Route, plan_route
 from slam.simulation.shapes import things
 from slam.simulation.texture import Axis, Texels
 from slam.simulation.town import build_town
-from slam.simulation.world import Hits, SimulatedWorld, Surface, place_rays, through_lens
+from slam.simulation.world import Hits, SimulatedWorld, Surface, place_rays
 
 STILL_FRAMES = 30  # of a stop: 3 s at 10 frames a second
 BLUR_SAMPLES = 6
@@ -55,8 +55,6 @@ class SimulatedStreet(SimulatedWorld):
         if options.varied:
             variety = draw_variety(options.seed, options.route == "straight")
             weather = draw_varied_weather
-        if options.fov_deg is not None:
-            variety = replace(variety, fov_deg=options.fov_deg, aspect=None, centre=(0.0, 0.0))
         self._route = plan_route(options.route, options.frames, options.seed, still, variety)
         super().__init__(options, variety.camera(*size), self._route.T_street_camera)
         self.camera_height_m = self._route.camera_height_m
@@ -190,7 +188,7 @@ class SimulatedStreet(SimulatedWorld):
         rgb = rgb * np.float32(self._gain)
         if "rain" in self.options.hazards:
             rgb = rained_on(rgb, self.options.seed, index)
-        rgb = through_lens(rgb, self._variety.blur_px)
+        rgb = cv2.GaussianBlur(rgb, (3, 3), self._variety.blur_px)
         if "exposure" in self.options.hazards:
             gain, gamma = self._exposure[index]
             rgb = np.asarray(gain * np.power(np.clip(rgb, 0.0, 1.0), gamma), dtype=np.float32)

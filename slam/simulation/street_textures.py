@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from slam.simulation.geometry import Material
 from slam.simulation.texture import (
     Axis,
     Lengths,
@@ -160,7 +159,7 @@ def _fence(texels: Texels) -> Lengths:
     return mix(texels.first * (1.0 + grain), texels.second, slats * rails)
 
 
-STREET_SHADERS: dict[Material, Shader] = {
+STREET_SHADERS: dict[str, Shader] = {
     "asphalt": _asphalt,
     "junction": _junction,
     "pavement": slabs(

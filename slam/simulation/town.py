@@ -1,5 +1,7 @@
 """Surfaces of a street plan: roads, pavements, lots and the objects on them."""
 
+import copy
+
 import numpy as np
 
 from slam.geometry import se3
@@ -186,7 +188,8 @@ class _Town:
         if self.more is None:
             return
         # a fence along a part of the kerb, thin posts, and people on the pavement
-        rng, kerb = self.more, kerb.drawn_by(self.more)
+        kerb = copy.copy(kerb)
+        rng = kerb.rng = self.more
         if rng.random() < 0.45 and length > 16.0:
             first, last = np.sort(rng.uniform(6.0, length - 6.0, 2))
             objects.fence(kerb.moved(first, rng.uniform(0.2, 0.8), KERB), last - first)

@@ -8,7 +8,6 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,14 +15,15 @@ from slam.formats.ply import Ply, distances, scene_of
 from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.runtime.imports import import_open3d
-from slam.simulation.geometry import MATERIALS, Float32Array, FloatArray, Mesh
+from slam.simulation.geometry import Float32Array, FloatArray, Mesh
 from slam.simulation.options import SimulationOptions
 from slam.simulation.room_textures import ROOM_SHADERS
 from slam.simulation.street_textures import STREET_SHADERS
 from slam.simulation.texture import Axis, Texels
 
 FARTHEST_M = 200.0  # surfaces beyond are treated as sky
-SHADERS = STREET_SHADERS | ROOM_SHADERS
+_SHADERS = STREET_SHADERS | ROOM_SHADERS
+MATERIALS = tuple(_SHADERS)
 
 
 class Surface:
@@ -96,7 +96,7 @@ class Hits:
                 second,
                 np.take(mesh.parameters, instance, axis=1),
             )
-            rgb[:, part] = SHADERS[MATERIALS[kind]](texels)
+            rgb[:, part] = _SHADERS[MATERIALS[kind]](texels)
         return rgb
 
     def _footprint(self, pixel: Float32Array) -> tuple[Float32Array, Float32Array]:
@@ -258,14 +258,3 @@ class SimulatedWorld(ABC):
             )
             rgb[seen] = self._shade(hits, surfaces).T
         return rgb
-
-
-def square_camera(width: int, height: int, fov_deg: float) -> Intrinsics:
-    """Of square pixels with a horizontal field of view, its centre in the middle."""
-    focal_px = float(0.5 * width / np.tan(0.5 * np.deg2rad(fov_deg)))
-    return Intrinsics(width, height, focal_px, focal_px, 0.5 * (width - 1), 0.5 * (height - 1))
-
-
-def through_lens(rgb: Float32Array, blur_px: float = 0.55) -> Float32Array:
-    """An image as blurred as a lens blurs it."""
-    return cv2.GaussianBlur(rgb, (3, 3), blur_px)

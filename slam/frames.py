@@ -321,13 +321,10 @@ class GpsTrack:
 
 def runs(frames: Collection[int]) -> list[tuple[int, int]]:
     """Unbroken runs of frame numbers as (first, last)."""
-    found: list[tuple[int, int]] = []
-    for index in sorted(frames):
-        if found and found[-1][1] == index - 1:
-            found[-1] = found[-1][0], index
-        else:
-            found.append((index, index))
-    return found
+    known = set(frames)
+    firsts = [k for k in known if k - 1 not in known]
+    lasts = [k for k in known if k + 1 not in known]
+    return list(zip(sorted(firsts), sorted(lasts)))
 
 
 def nearest(values: NDArray[_Kind], pixels: NDArray[np.floating[Any]]) -> NDArray[_Kind]:

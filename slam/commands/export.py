@@ -210,12 +210,9 @@ def _model_points(
     if cloud is not None:
         if len(points):
             colours = cloud.colours[cKDTree(cloud.points).query(points)[1]]
-        count = (
-            len(cloud.points)
-            if at_most is None
-            else min(max(at_most - len(points), 0), len(cloud.points))
-        )
-        rows = np.linspace(0, len(cloud.points) - 1, count).round().astype(np.intp)
+        most = len(cloud.points)
+        count = most if at_most is None else min(at_most - len(points), most)
+        rows = np.linspace(0, most - 1, count).round().astype(np.intp)
         points = np.concatenate([points, cloud.points[rows]])
         colours = np.concatenate([colours, cloud.colours[rows]])
     return points, colours, sightings

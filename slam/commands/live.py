@@ -123,9 +123,8 @@ class LiveRecorder(FolderRecorder):
             logger.warning("%d images dropped, %d measured", dropped, len(sequence))
         for newest in self._poses.add(observer):
             index, self._said = self._said, self._said + 1
-            at_s = sequence.arrived_s.get(index)
             support = None if newest.support is None else round(newest.support, 2)
-            late_ms = None if at_s is None else round(1e3 * (time.monotonic() - at_s), 1)
+            late_s = time.monotonic() - sequence.arrived_s[index]
             message = {
                 "type": "pose",
                 "frame": index,
@@ -136,7 +135,7 @@ class LiveRecorder(FolderRecorder):
                 "support": support,
                 # row by row as in KITTI's files
                 "T_world_camera": newest.T_world_camera[:3].ravel().tolist(),
-                "latency_ms": late_ms,
+                "latency_ms": round(1e3 * late_s, 1),
                 "dropped": sequence.dropped,
             }
             self._emit(message)

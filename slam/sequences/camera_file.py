@@ -29,6 +29,7 @@ from erfsfm.common.readers.camera_file import (
     UNKNOWN_FOV_DEG,
     UNKNOWN_FX_SIGMA,
     CameraFile,
+    Pinhole,
     camera_of,
     is_auto,
     is_line,
@@ -156,11 +157,18 @@ def explicit_camera(given: Path, images: Sized, fps: float | None = None) -> Cam
         logger.warning("pixels are %.3g times as wide as high, as the video says", aspect)
     focal_px = width / 2 / math.tan(math.radians(fov_deg) / 2)
     centre = (width - 1) / 2, (height - 1) / 2
-    keys = pinhole_keys(width, height, focal_px, aspect * focal_px, *centre)
-    keys |= {"fps": fps, "camera_height_m": values.get("height")}
-    keys |= {"fx_sigma": UNKNOWN_FX_SIGMA if is_auto(given) else _STATED_FX_SIGMA}
-    source = f"a horizontal field of view of {fov_deg:g} degrees"
-    return camera_of({**keys, "source": source}, str(given))
+    keys = pinhole_keys(
+        width,
+        height,
+        focal_px,
+        aspect * focal_px,
+        *centre,
+        fps=fps,
+        camera_height_m=values.get("height"),
+        fx_sigma=UNKNOWN_FX_SIGMA if is_auto(given) else _STATED_FX_SIGMA,
+        source=f"a horizontal field of view of {fov_deg:g} degrees",
+    )
+    return camera_of(keys, str(given))
 
 
 def read_explicit(path: Path, fps: float | None = None) -> CameraFile:
@@ -177,10 +185,10 @@ def read_explicit(path: Path, fps: float | None = None) -> CameraFile:
 
 def beside(*folders: Path, own: Mapping[str, Any] | None = None) -> CameraFile | None:
     """The first ``camera.yaml`` found in ``folders``, or None; keys that it lacks are those of the ``own`` camera."""
-    path = next(
-        (folder / CAMERA_FILE for folder in folders if (folder / CAMERA_FILE).exists()), None
-    )
-    return None if path is None else read_camera_file(path, own)
+    for folder in folders:
+        if (folder / CAMERA_FILE).exists():
+            return read_camera_file(folder / CAMERA_FILE, own)
+    return None
 
 
 def require_stated(given: Path | None) -> None:
@@ -252,9 +260,9 @@ def lens_model(
     )
 
 
-def pinhole_keys(width: Any, height: Any, fx: Any, fy: Any, cx: Any, cy: Any, **more: Any) -> Keys:
-    """The keys of ``camera.yaml`` for a camera, pixels, and ``more`` of them."""
-    return {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **more}
+def pinhole_keys(*pinhole: Any, **more: Any) -> Keys:
+    """The keys of ``camera.yaml`` for the values of a `Pinhole`, and ``more`` of them."""
+    return vars(Pinhole(*pinhole)) | more
 
 
 def _kalibr(camera: Keys) -> Keys:

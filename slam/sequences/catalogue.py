@@ -299,9 +299,7 @@ def open_series(pieces: Sequence[Piece], openers: Sequence[Opener]) -> RecordedS
         camera=first.camera,
         stamps=_stamps(pieces, [part.stamps for part in parts]),
         sources=tuple(sources),
-        T_any_camera=np.concatenate(poses)
-        if any(part.T_any_camera is not None for part in parts)
-        else None,
+        T_any_camera=np.concatenate(poses),
         usual_height_m=first.camera_height_m,
         T_camera_lidar=first.T_camera_lidar,
         scans=scans,

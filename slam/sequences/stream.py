@@ -48,7 +48,7 @@ class StreamedSequence(GrowingSequence):
 
     Attributes:
         waiting: stamps, images, and when they came.
-        arrived_s: when the last frames came, by frame, by the monotonic clock.
+        arrived_s: when each frame came, by the monotonic clock.
         dropped: number of images that waited, and were too old when another one came.
         ended: why there are no more after those that wait; empty while more may come.
     """
@@ -82,7 +82,7 @@ class StreamedSequence(GrowingSequence):
                 f"{name} does not wait while an image is measured: leave out --every-frame"
             )
         super().__init__(camera, name=name)
-        self.arrived_s: dict[int, float] = {}
+        self.arrived_s: list[float] = []
         self.dropped, self.ended = 0, ""
         self._source, self._most_wait_s, self._every_frame = source, most_wait_s, every_frame
         self.waiting: deque[tuple[float, Image, float]] = deque()
@@ -97,9 +97,7 @@ class StreamedSequence(GrowingSequence):
             image = image if self.undistortion is None else self.undistortion.apply(image)
             image.setflags(write=False)
             self.stamps = np.append(self.stamps, stamp)
-            self.arrived_s = {k: v for k, v in self.arrived_s.items() if k >= index - 2} | {
-                index: at_s
-            }
+            self.arrived_s.append(at_s)
             yield Frame(index, stamp, image, self.fixed)
 
     def stop(self) -> None:

@@ -140,10 +140,12 @@ def drives_of(
     """
     path = manifest_or_root
     if path.suffix.lower() != _MANIFEST or path.is_dir():
-        return _of_data_set(path, sequences, options)
-    if list(sequences) != ["all"]:
+        rows = _rows_of_data_set(path, sequences)
+    elif list(sequences) == ["all"]:
+        rows = _manifest(path)
+    else:
         raise SequenceError(f"{path} names its sequences itself: leave out --sequence")
-    return _manifest(path, options)
+    return _named(_drive(row, path, number, options) for number, row in enumerate(rows, 1))
 
 
 def run_drives(
@@ -272,7 +274,8 @@ def summary_table(outcomes: Sequence[Outcome]) -> Table:
     )
 
 
-def _of_data_set(root: Path, sequences: Sequence[str], options: Sequence[str]) -> list[Drive]:
+def _rows_of_data_set(root: Path, sequences: Sequence[str]) -> list[dict[str, str]]:
+    """The rows of a manifest of the same drives."""
     names = list(sequence_kinds(root))
     if not names:
         raise SequenceError(f"{root} is no manifest ({_MANIFEST}) and holds no sequences")
@@ -280,13 +283,11 @@ def _of_data_set(root: Path, sequences: Sequence[str], options: Sequence[str]) -
     if missing:
         raise SequenceError(f"{root} has no sequence {missing[0]}: it has {', '.join(names)}")
     root = root.absolute() if root.exists() else root  # KITTI may be named by the environment alone
-    return _named(
-        Drive(name, root.absolute().parent, ("--dataset", str(root), "--sequence", name, *options))
-        for name in (names if "all" in sequences else sequences)
-    )
+    chosen = names if "all" in sequences else sequences
+    return [{"dataset": str(root), "sequence": name} for name in chosen]
 
 
-def _manifest(path: Path, options: Sequence[str]) -> list[Drive]:
+def _manifest(path: Path) -> list[dict[str, str]]:
     try:
         lines = io.StringIO(read_text(path), newline="")
         rows = []
@@ -304,21 +305,19 @@ def _manifest(path: Path, options: Sequence[str]) -> list[Drive]:
     twice = next((name for name in given if given.count(name) > 1), None)
     if twice is not None:
         raise SequenceError(f"{path}: two drives are named {twice}: choose other names")
-    return _named(
-        _drive(row, path, f"{path}, drive {number}", options) for number, row in enumerate(rows, 1)
-    )
+    return rows
 
 
-def _drive(row: dict[str, str], path: Path, where: str, options: Sequence[str]) -> Drive:
+def _drive(row: dict[str, str], path: Path, number: int, options: Sequence[str]) -> Drive:
     unknown = [str(key) for key in row if key not in _KEYS]
     if unknown or "dataset" not in row:
         problem = f"{unknown[0]!r} is no key" if unknown else "dataset is missing"
-        raise SequenceError(f"{where}: {problem}; the keys are {', '.join(_KEYS)}")
+        raise SequenceError(f"{path}, drive {number}: {problem}; the keys are {', '.join(_KEYS)}")
     try:
         own = shlex.split(row.get("options", ""))
     except ValueError as error:
         raise SequenceError(
-            f"{where}: options are not understood ({error}): write them as on a command line"
+            f"{path}, drive {number}: options are not understood ({error}): write them as on a command line"
         ) from error
     named = []
     for key in ("dataset", "sequence", "camera"):

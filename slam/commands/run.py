@@ -30,7 +30,6 @@ from slam.frames import Sequence as FrameSequence
 from slam.frontend.fixed_mask import FixedMask
 from slam.frontend.self_calibration import MOST_FRAMES, find_camera
 from slam.mapping.depth import KeyframeDepth
-from slam.mapping.surface import MapSurface
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.run import Recorder, SlamPipeline, look_ahead, read_frame
 from slam.prediction.assembly import open_prediction
@@ -202,11 +201,24 @@ class FolderRecorder(Recorder):
 
     def map(self, estimate: Estimate | Failed) -> None:
         """Merge the submaps, write mesh and cloud; without a map its metrics are the reason."""
-        surface = self._surface(estimate)
-        if isinstance(surface, Failed):
-            self._metrics = self._metrics.changed(map=MapMetrics.unknown(surface.reason))
-            return
-        assert isinstance(estimate, Estimate) and estimate.map is not None
+        found = estimate if isinstance(estimate, Failed) else self._mapped(estimate)
+        if isinstance(found, Failed):
+            found = MapMetrics.unknown(found.reason)
+        self._metrics = self._metrics.changed(map=found)
+
+    def _mapped(self, estimate: Estimate) -> MapMetrics | Failed:
+        """The metrics of mesh and cloud, which are written, or why there are none."""
+        if estimate.map is None:
+            is_enabled = self._settings.mapping.enabled
+            return Failed(
+                _NO_KEYFRAMES if is_enabled else "fusion is switched off (mapping.enabled)"
+            )
+        try:
+            with self._stopwatch.stage("mesh"):
+                surface = estimate.map.surface(self._progress)
+        except EmptyMapError as error:
+            logger.warning("no map: %s", error)
+            return Failed(str(error))
         self._progress("map files", 0, 1)
         with self._stopwatch.stage("mesh"):
             surface.write_mesh(self.folder.path / MAP_MESH)
@@ -221,25 +233,7 @@ class FolderRecorder(Recorder):
             pieces = lambda: (Ply(piece).points for piece in surface.cloud_pieces())  # noqa: E731
             errors = map_errors(pieces, estimate, self.pipeline.sequence)
         self._progress("map files", 1, 1)
-        sizes = estimate.map.statistics()
-        found = MapMetrics.of(**sizes, double_wall_share=share, **errors)
-        self._metrics = self._metrics.changed(map=found)
-
-    def _surface(self, estimate: Estimate | Failed) -> MapSurface | Failed:
-        """The surface of the map, or why there is none."""
-        if isinstance(estimate, Failed):
-            return estimate
-        if estimate.map is None:
-            is_enabled = self._settings.mapping.enabled
-            return Failed(
-                _NO_KEYFRAMES if is_enabled else "fusion is switched off (mapping.enabled)"
-            )
-        try:
-            with self._stopwatch.stage("mesh"):
-                return estimate.map.surface(self._progress)
-        except EmptyMapError as error:
-            logger.warning("no map: %s", error)
-            return Failed(str(error))
+        return MapMetrics.of(**estimate.map.statistics(), double_wall_share=share, **errors)
 
     def finish(self, estimate: Estimate) -> None:
         """The report and all metrics of a whole run."""

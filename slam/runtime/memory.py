@@ -6,6 +6,7 @@ Spilled arrays limit the memory of a long drive.
 from __future__ import annotations
 
 import ctypes
+import os
 import resource
 import sys
 import tempfile
@@ -42,7 +43,6 @@ class SpillFile:
         """An empty file; ``what`` names its content in errors."""
         self._what = what
         self._file = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as this object
-        self._end = 0
         self._lock = Lock()  # the file has one position, which every write and read moves
 
     def put(self, array: NDArray[Any]) -> Spilled:
@@ -54,11 +54,9 @@ class SpillFile:
         content = np.ascontiguousarray(array)
         try:
             with self._lock:
-                start = self._end
-                self._file.seek(start)
+                start = self._file.seek(0, os.SEEK_END)
                 self._file.write(content.data)
                 self._file.flush()
-                self._end += content.nbytes
         except OSError as error:
             raise SlamError(
                 f"{self._what} cannot be kept in {tempfile.gettempdir()} ({error.strerror or error}): "

@@ -287,13 +287,19 @@ def _open_seven_scenes(folder: Path, asked: Path | None) -> RecordedSequence:
     own = partial(
         CameraFile, width=640, height=480, fx=585.0, fy=585.0, cx=320.0, cy=240.0, fps=_FPS
     )
-    known = {
-        "T_any_camera": pose_files([frame.with_suffix(".pose.txt") for frame in frames], stamps),
-        "depth_maps": _depth_maps(
-            [frame.with_suffix(".depth.png") for frame in frames], _SEVEN_SCENES_UNKNOWN
-        ),
-    }
-    return _recorded("7scenes", name, files, stamps, asked, places, own, numbers[0], **known)
+    depths = [frame.with_suffix(".depth.png") for frame in frames]
+    return _recorded(
+        "7scenes",
+        name,
+        files,
+        stamps,
+        asked,
+        places,
+        own,
+        numbers[0],
+        T_any_camera=pose_files([frame.with_suffix(".pose.txt") for frame in frames], stamps),
+        depth_maps=_depth_maps(depths, _SEVEN_SCENES_UNKNOWN),
+    )
 
 
 # ScanNet as its reader exports it: {color/0.jpg,depth/0.png,pose/0.txt,intrinsic}
@@ -310,12 +316,17 @@ def _open_scannet(folder: Path, asked: Path | None) -> RecordedSequence:
     numbers = np.interp(np.arange(len(files)), files.rows, there).round().astype(int).tolist()
     stamps = np.array(numbers) / _FPS
     own = partial(_scannet_camera, folder / _SCANNET_CAMERA, files)
-    known = {
-        "T_any_camera": pose_files([folder / "pose" / f"{k}.txt" for k in numbers], stamps),
-        "depth_maps": _depth_maps([folder / "depth" / f"{k}.png" for k in numbers]),
-    }
     return _recorded(
-        "scannet", folder.name, files, stamps, asked, [folder], own, numbers[0], **known
+        "scannet",
+        folder.name,
+        files,
+        stamps,
+        asked,
+        [folder],
+        own,
+        numbers[0],
+        T_any_camera=pose_files([folder / "pose" / f"{k}.txt" for k in numbers], stamps),
+        depth_maps=_depth_maps([folder / "depth" / f"{k}.png" for k in numbers]),
     )
 
 
@@ -358,8 +369,19 @@ def _open_nuscenes(root: Path, tables: Path, scene: str, asked: Path | None) -> 
             f"the tables in {tables} are not those of nuScenes: {error!r}; copy them again"
         ) from error
     own = partial(camera_of, keys, str(tables / "calibrated_sensor.json"))
-    known = {"T_any_camera": T_any_camera, "T_camera_lidar": T_camera_lidar, "scans": scans}
-    return _recorded("nuscenes", scene, files, stamps, asked, [root], own, files.first, **known)
+    return _recorded(
+        "nuscenes",
+        scene,
+        files,
+        stamps,
+        asked,
+        [root],
+        own,
+        files.first,
+        T_any_camera=T_any_camera,
+        T_camera_lidar=T_camera_lidar,
+        scans=scans,
+    )
 
 
 def _scene(tables: Path, scene: str) -> dict[str, list[Row]]:

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial.transform import Rotation
 
 from slam.geometry import se3
-from slam.simulation.geometry import FloatArray, IntArray
+from slam.simulation.geometry import FloatArray, IntArray, luck
 from slam.simulation.interior import Interior
 
 CELL = 0.08  # of the floor, metres
@@ -58,7 +58,7 @@ class Floor:
         # of each cell of the floor, (C, 2)
         self._centres = self._origin + CELL * (0.5 + np.argwhere(free >= 0)[:, ::-1])
         self._graph = self._connect()
-        rng = np.random.default_rng([seed, 52])
+        rng = luck(seed, 52)
         _, part = connected_components(self._graph, directed=False)
         roomy = self._clearance.ravel() >= _PLACE_CLEAR_M
         roomy &= part == np.bincount(part).argmax()
@@ -167,7 +167,7 @@ class Carried:
             rate: frames a second of the camera, which limits how fast it turns.
             seed: of the world.
         """
-        rng, gait = np.random.default_rng([seed, 53, *motion.encode()]), GAITS[motion]
+        rng, gait = luck(seed, 53, *motion.encode()), GAITS[motion]
         turn = np.deg2rad(min(gait.turn_deg, 0.9 * FASTEST_TURN_DEG * rate))
         base = _Walk(floor, gait, turn, rng).over(int(np.ceil(seconds * CLOCK)) + 2)
         base = gaussian_filter1d(base, _SETTLED_S * CLOCK, axis=0, mode="nearest")

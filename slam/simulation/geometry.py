@@ -12,8 +12,6 @@ Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.int64]
 
 PARAMETERS = 6  # of a texture
-# fields of a mesh whose last axis is that of its triangles
-_OF_TRIANGLES = ("uv", "normals", "tangents", "instance", "material")
 
 
 @dataclass(frozen=True)
@@ -34,11 +32,6 @@ class Mesh:
     colours: Float32Array  # two base colours per instance, RGB in [0, 1], (2, 3, I)
     parameters: Float32Array  # of the material's texture, (PARAMETERS, I)
     offsets: Float32Array  # of an instance in the noise texture, (2, I)
-
-    def part(self, chosen: NDArray[np.bool_]) -> "Mesh":
-        """Some of its triangles ``(T,)``."""
-        tables = {name: getattr(self, name)[..., chosen] for name in _OF_TRIANGLES}
-        return replace(self, triangles=self.triangles[chosen], **tables)
 
     def placed(self, T_scene_mesh: FloatArray) -> "Mesh":
         """The same at a pose ``(4, 4)``."""

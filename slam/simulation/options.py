@@ -7,6 +7,7 @@ import numpy as np
 
 from slam.frames import Intrinsics
 from slam.runtime.errors import SequenceError
+from slam.simulation.geometry import luck
 
 VERSION = 3  # of the worlds: the same options give the same bytes within a version
 _MOST_FRAMES = 100_000
@@ -135,7 +136,7 @@ USUAL = Variety(
 
 def draw_variety(seed: int, lone_road: bool) -> Variety:
     """The variety of a seed; only a lone road is a motorway."""
-    rng = np.random.default_rng([seed, 5])
+    rng = luck(seed, 5)
     kind: StreetKind = get_args(StreetKind)[rng.choice(4, p=_STREET_SHARES)]
     lowest, highest = (0.5, 2.5) if rng.random() < 0.5 else (1.2, 2.0)
     height_m = float(np.exp(rng.uniform(np.log(lowest), np.log(highest))))

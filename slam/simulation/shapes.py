@@ -238,14 +238,11 @@ def _last(table: FloatArray) -> Float32Array:
 
 
 def things(rng: np.random.Generator, makers: Sequence[Callable[[Site], None]]) -> list[Mesh]:
-    """What each maker makes around its own origin, one after another at one site."""
-    site, after = Site(rng), []
-    for make in makers:
+    """What each maker makes around its own origin; all draw from the same random numbers."""
+    sites = [Site(rng) for _ in makers]
+    for site, make in zip(sites, makers):
         make(site)
-        after.append(len(site.looks))
-    mesh = site.finish(FLAT)
-    thing_of_triangle = np.searchsorted(after, mesh.instance, side="right")
-    return [mesh.part(thing_of_triangle == number) for number in range(len(makers))]
+    return [site.finish(FLAT) for site in sites]
 
 
 def lattice(u: ArrayLike, v: ArrayLike) -> FloatArray:

@@ -175,15 +175,15 @@ def run_drives(
     output.mkdir(parents=True, exist_ok=True)
     threads = threads or (0 if scheduler else max((os.cpu_count() or 1) // count, 1))
     work = partial(run_drive, output=output.absolute(), threads=threads, memory_gib=memory_gib)
-    outcomes: dict[int, Outcome] = {}
+    outcomes: dict[str, Outcome] = {}
     progress("drives", 0, len(drives))
-    for number, result in spread(work, drives, min(count, len(drives)), scheduler):
+    for drive, result in spread(work, drives, min(count, len(drives)), scheduler):
         if not isinstance(result, Outcome):
             reason = one_line(f"{type(result).__name__}: {result}")
-            result = Outcome(drives[number], output / drives[number].name, "failed", reason)
-        outcomes[number] = result
+            result = Outcome(drive, output / drive.name, "failed", reason)
+        outcomes[drive.name] = result
         progress("drives", len(outcomes), len(drives))
-    ordered = [outcomes[number] for number in range(len(drives))]
+    ordered = [outcomes[drive.name] for drive in drives]
     rows = list(map(_row, ordered))
     if (output / CSV).exists():  # an earlier batch may have had other drives
         names, before = {drive.name for drive in drives}, io.StringIO(read_text(output / CSV))
@@ -197,17 +197,17 @@ def spread(
     drives: Sequence[Drive],
     count: int = 1,
     scheduler: str | None = None,
-) -> Iterator[tuple[int, Outcome | BaseException]]:
-    """The number and the result of each drive, as they end; the result of work that fails is its exception.
+) -> Iterator[tuple[Drive, Outcome | BaseException]]:
+    """Each drive with its result, as they end; the result of work that fails is its exception.
 
     One worker works here, without Dask. Drives of a worker that dies are given to another.
     """
     if count == 1 and scheduler is None:
-        for number, drive in enumerate(drives):
+        for drive in drives:
             try:
-                yield number, work(drive)
+                yield drive, work(drive)
             except Exception as error:
-                yield number, error
+                yield drive, error
         return
     (distributed,) = import_extra("cluster")
     # memory is that of each drive's process, whose limit is not Dask's
@@ -225,9 +225,9 @@ def spread(
         raise SlamError(f"no Dask scheduler answers at {scheduler}: {error}") from error
     with client:
         futures = client.map(work, drives, pure=False)
-        numbers = {future.key: number for number, future in enumerate(futures)}
+        drive_of = dict(zip(futures, drives, strict=True))
         for future in distributed.as_completed(futures):
-            yield numbers[future.key], future.exception() or future.result()
+            yield drive_of[future], future.exception() or future.result()
 
 
 def run_drive(drive: Drive, output: Path, threads: int = 0, memory_gib: float = 0.0) -> Outcome:
@@ -279,9 +279,9 @@ def _rows_of_data_set(root: Path, sequences: Sequence[str]) -> list[dict[str, st
     names = list(sequence_kinds(root))
     if not names:
         raise SequenceError(f"{root} is no manifest ({_MANIFEST}) and holds no sequences")
-    missing = [name for name in sequences if name != "all" and name not in names]
-    if missing:
-        raise SequenceError(f"{root} has no sequence {missing[0]}: it has {', '.join(names)}")
+    for name in sequences:
+        if name not in ("all", *names):
+            raise SequenceError(f"{root} has no sequence {name}: it has {', '.join(names)}")
     root = root.absolute() if root.exists() else root  # KITTI may be named by the environment alone
     chosen = names if "all" in sequences else sequences
     return [{"dataset": str(root), "sequence": name} for name in chosen]
@@ -302,9 +302,9 @@ def _manifest(path: Path) -> list[dict[str, str]]:
     if not rows:
         raise SequenceError(f"{path} names no drive: give rows of {', '.join(_KEYS)}")
     given = [row["name"] for row in rows if "name" in row]
-    twice = next((name for name in given if given.count(name) > 1), None)
-    if twice is not None:
-        raise SequenceError(f"{path}: two drives are named {twice}: choose other names")
+    for name in given:
+        if given.count(name) > 1:
+            raise SequenceError(f"{path}: two drives are named {name}: choose other names")
     return rows
 
 

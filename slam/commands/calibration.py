@@ -23,7 +23,7 @@ from slam.sequences.calibration import (
     find_views,
     fit_camera,
 )
-from slam.sequences.camera_file import DEFAULT_FPS, Undistortion
+from slam.sequences.camera_file import DEFAULT_FPS, Undistortion, pinhole_keys
 from slam.sequences.images import ImageFiles, ImageSource
 
 _WELL_COVERED = 0.6
@@ -57,14 +57,9 @@ def calibrate_camera(
     fit = fit_camera(views, images.width, images.height, model)
     source = f"erfsfm-slam calibrate: {len(fit.views)} views of a {board.describe()}, "
     source += f"reprojection error {fit.error_px:.3f} pixels"
-    fx, fy, cx, cy = map(_rounded, fit.K[[0, 1, 0, 1], [0, 1, 2, 2]])
+    focal_and_centre = map(_rounded, fit.K[[0, 1, 0, 1], [0, 1, 2, 2]])
     camera = CameraFile(
-        width=fit.width,
-        height=fit.height,
-        fx=fx,
-        fy=fy,
-        cx=cx,
-        cy=cy,
+        **pinhole_keys(fit.width, fit.height, *focal_and_centre),
         fps=fps or _rounded(own_fps or DEFAULT_FPS),
         camera_height_m="unknown",
         model=model,

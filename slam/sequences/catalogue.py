@@ -264,11 +264,11 @@ def open_series(pieces: Sequence[Piece], openers: Sequence[Opener]) -> RecordedS
     """
     parts = [opener() for opener in openers]
     first = parts[0]
-    other = next((part for part in parts if part.intrinsics != first.intrinsics), None)
-    if other is not None:
-        raise SequenceError(
-            f"{other.name} is of another camera than {first.name}: give one of the files as --dataset"
-        )
+    for part in parts:
+        if part.intrinsics != first.intrinsics:
+            raise SequenceError(
+                f"{part.name} is of another camera than {first.name}: give one of the files as --dataset"
+            )
     logger.info(
         "%s are taken as one recording; give one of the files as --dataset for that alone",
         ", ".join(piece.name for piece in pieces),

@@ -61,11 +61,11 @@ def _open_odometry(root: OdometryRoot, name: str, asked: Path | None) -> Recorde
     calibration = CalibrationFile(folder / kitti.ODOMETRY_CALIBRATION)
     T_camera_cam0 = calibration.T_camera_cam0(f"P{number}")
     simulated = root.simulation_seed()
-    key = next((key for key in ("Tr", "Tr_velo_to_cam") if key in calibration), None)
     T_camera_lidar = None
-    if key is not None:
-        T_cam0_lidar = np.vstack([calibration.matrix(key, (3, 4)), [0.0, 0.0, 0.0, 1.0]])
-        T_camera_lidar = T_camera_cam0 @ T_cam0_lidar
+    for key in ("Tr_velo_to_cam", "Tr"):
+        if key in calibration:
+            T_cam0_lidar = np.vstack([calibration.matrix(key, (3, 4)), [0.0, 0.0, 0.0, 1.0]])
+            T_camera_lidar = T_camera_cam0 @ T_cam0_lidar
     return RecordedSequence(
         name=name,
         images=stored,

@@ -284,9 +284,8 @@ def _open_seven_scenes(folder: Path, asked: Path | None) -> RecordedSequence:
     files = by_table([frame.with_suffix(".color.png") for frame in frames], folder)
     stamps = np.arange(numbers[0], numbers[-1] + 1) / _FPS
     name, places = f"{folder.parent.name}_{folder.name}", (folder, folder.parent)
-    own = partial(
-        CameraFile, width=640, height=480, fx=585.0, fy=585.0, cx=320.0, cy=240.0, fps=_FPS
-    )
+    keys = pinhole_keys(640, 480, 585.0, 585.0, 320.0, 240.0, fps=_FPS)
+    own = partial(CameraFile, **keys)
     depths = [frame.with_suffix(".depth.png") for frame in frames]
     return _recorded(
         "7scenes",
@@ -308,9 +307,9 @@ def _open_seven_scenes(folder: Path, asked: Path | None) -> RecordedSequence:
 def _open_scannet(folder: Path, asked: Path | None) -> RecordedSequence:
     """Stamps follow from the numbers of the images, also where every n-th was exported."""
     paths = list_images(folder / "color")
-    unnamed = next((path for path in paths if not path.stem.isdecimal()), None)
-    if unnamed is not None:
-        raise SequenceError(f"{unnamed} is not named by its number, as 0.jpg: rename it")
+    for path in paths:
+        if not path.stem.isdecimal():
+            raise SequenceError(f"{path} is not named by its number, as 0.jpg: rename it")
     files = by_name(paths)
     there = [int(path.stem) for path in files.paths]
     numbers = np.interp(np.arange(len(files)), files.rows, there).round().astype(int).tolist()

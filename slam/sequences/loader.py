@@ -95,9 +95,9 @@ def open_folder(folder: Path, asked: Path | None) -> RecordedSequence:
 
 def _times_of_images(places: list[Path], files: NumberedFiles, fps: float) -> FloatArray:
     """By a file, by names that are times since 1970, or at the rate of the camera."""
-    path = next((path for path in places if path.exists()), None)
-    if path is not None:
-        return read_stamps(path, files)
+    for place in places:
+        if place.exists():
+            return read_stamps(place, files)
     times = [_NAMED_BY_TIME.fullmatch(path.stem) for path in files.paths]
     if len(times) == len(files) and all(times):
         stamps = np.array([float(f"{match[1]}.{match[2]}") for match in times if match is not None])

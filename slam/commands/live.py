@@ -77,10 +77,8 @@ def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
         networks.depth(blank)  # both are loaded before images come
         networks.poses([blank] * (networks.sources + 1))
         viewer = Viewer(sequence.intrinsics) if request.view else None
-        folder = RunFolder.create(request.output, Path(settings.output.root), name, lock)
-        recorder = LiveRecorder(
-            folder, pipeline, settings, provenance_of(request, sequence, networks, depth)
-        )
+        provenance = provenance_of(request, sequence, networks, depth)
+        recorder = LiveRecorder(request, pipeline, settings, provenance, lock)
         poses = LivePoses(networks.sources, pipeline.unit)
         recorder.follow(sequence, poses, emit, viewer)
         try:
@@ -98,7 +96,7 @@ def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
             ) from error
         finally:
             sequence.close()
-    return folder
+    return recorder.folder
 
 
 class LiveRecorder(FolderRecorder):

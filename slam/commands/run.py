@@ -93,6 +93,7 @@ class Request(Section):
     seed: int = Field(default=0, ge=0, lt=2**31)
     device: Literal["auto", "cpu", "cuda"] = "auto"
     command: str = "slam.run_slam"  # recorded in the metrics
+    progress: Progress = silent  # called with (stage, done, total)
 
     @classmethod
     def of(cls, **arguments: Any) -> Self:
@@ -128,7 +129,6 @@ class RunRequest(Request):
     truth: Path | None = None
     rerun: Path | None = None
     gps: Path | None = None
-    progress: Progress = silent  # called with (stage, done, total)
 
 
 class FolderRecorder(Recorder):
@@ -136,15 +136,16 @@ class FolderRecorder(Recorder):
 
     def __init__(
         self,
-        folder: RunFolder,
+        request: Request,
         pipeline: SlamPipeline,
         settings: SlamConfig,
         provenance: Provenance,
-        progress: Progress = silent,
+        lock: FolderLock,
     ) -> None:
-        """Prepare to write what a pipeline gives."""
-        self.folder, self.pipeline = folder, pipeline
-        self._settings, self._provenance, self._progress = settings, provenance, progress
+        """Prepare to write what a pipeline gives, to a folder that is made."""
+        results, name = Path(settings.output.root), pipeline.sequence.name
+        self.folder = RunFolder.create(request.output, results, name, lock)
+        self.pipeline, self._settings, self._progress = pipeline, settings, request.progress
         self._metrics = Metrics(schema_=1, status="running", reason=_BEGUN, provenance=provenance)
 
     def begin(self) -> None:
@@ -174,7 +175,7 @@ class FolderRecorder(Recorder):
         folder.write(PLACES, estimate.places(sequence.intrinsics).write)
         with estimate.stopwatch.stage("evaluation"):
             self._metrics = estimate_metrics(
-                estimate, sequence, self._provenance, self._settings.gps.factors
+                estimate, sequence, self._metrics.provenance, self._settings.gps.factors
             )
         folder.write_metrics(self._metrics)
         self._stopwatch = estimate.stopwatch
@@ -345,21 +346,16 @@ def perform(request: RunRequest) -> RunFolder:
             request.weights, request.device, settings.depth, camera, numbers, undistort
         )
         track = None if request.gps is None else read_gps(request.gps)
-        progress = request.progress
-        pipeline = SlamPipeline(recording, predictor, settings, progress, request.seed, track)
-        pipeline.require_possible()
-        folder = RunFolder.create(request.output, Path(settings.output.root), recording.name, lock)
-        recorder = FolderRecorder(
-            folder,
-            pipeline,
-            settings,
-            provenance_of(request, recording, networks, source),
-            progress,
+        pipeline = SlamPipeline(
+            recording, predictor, settings, request.progress, request.seed, track
         )
+        pipeline.require_possible()
+        provenance = provenance_of(request, recording, networks, source)
+        recorder = FolderRecorder(request, pipeline, settings, provenance, lock)
         estimate = record(recorder, log, ignore_signals)
         if request.rerun is not None:
             write_rerun(request.rerun, estimate, pipeline.sequence.intrinsics)
-    return folder
+    return recorder.folder
 
 
 def open_recording(request: RunRequest) -> RecordedSequence:

@@ -269,43 +269,53 @@ def _kalibr(camera: Keys) -> Keys:
     """Of Kalibr's ``cam0`` or EuRoC's ``sensor.yaml``."""
     _require_pinhole(camera, "camera_model")
     distortion = camera.get("distortion_coeffs") or camera.get("distortion_coefficients") or []
-    lens = {
-        "distortion": distortion,
-        "model": lens_model(camera.get("distortion_model"), distortion),
-    }
-    pinhole = *camera["resolution"], *camera["intrinsics"]
-    return pinhole_keys(*pinhole, fps=camera.get("rate_hz"), **lens)
+    return pinhole_keys(
+        *camera["resolution"],
+        *camera["intrinsics"],
+        fps=camera.get("rate_hz"),
+        model=lens_model(camera.get("distortion_model"), distortion),
+        distortion=distortion,
+    )
 
 
 def _camera_info(content: Keys) -> Keys:
     fx, _, cx, _, fy, cy, *_ = content["camera_matrix"]["data"]
-    keys = pinhole_keys(content["image_width"], content["image_height"], fx, fy, cx, cy)
+    size = content["image_width"], content["image_height"]
     distortion = content.get("distortion_coefficients", {}).get("data", [])
     model = lens_model(content.get("distortion_model"), distortion)
-    return {**keys, "model": model, "distortion": distortion}
+    return pinhole_keys(*size, fx, fy, cx, cy, model=model, distortion=distortion)
 
 
 def _orb_slam(content: Keys) -> Keys:
     prefix = "Camera1" if "Camera1.fx" in content else "Camera"
     focal = (content[f"{prefix}.{name}"] for name in ("fx", "fy", "cx", "cy"))
     model = lens_model(content.get("Camera.type", "PinHole"), ())
-    names = _ORB_COEFFICIENTS[model]
-    keys = pinhole_keys(content["Camera.width"], content["Camera.height"], *focal)
     lens = {key: content[key] for key in content if _ORB_COEFFICIENT.fullmatch(key)}
-    known = [f"{prefix}.{name}" for name in names]
+    known = [f"{prefix}.{name}" for name in _ORB_COEFFICIENTS[model]]
     _refuse_others(lens, known, f"a {model} lens")
-    distortion = [lens.get(name, 0.0) for name in known]
-    return {**keys, "fps": content.get("Camera.fps"), "model": model, "distortion": distortion}
+    return pinhole_keys(
+        content["Camera.width"],
+        content["Camera.height"],
+        *focal,
+        fps=content.get("Camera.fps"),
+        model=model,
+        distortion=[lens.get(name, 0.0) for name in known],
+    )
 
 
 def _vins(content: Keys) -> Keys:
     _require_pinhole(content, "model_type")
     pinhole = content["projection_parameters"]
     focal = (pinhole[name] for name in ("fx", "fy", "cx", "cy"))
-    keys = pinhole_keys(content["image_width"], content["image_height"], *focal)
     lens = content["distortion_parameters"]
     _refuse_others(lens, _VINS_COEFFICIENTS, "VINS")
-    return {**keys, "model": "opencv", "distortion": [lens[name] for name in _VINS_COEFFICIENTS]}
+    return pinhole_keys(
+        content["image_width"],
+        content["image_height"],
+        *focal,
+        model="opencv",
+        distortion=[lens[name] for name in _VINS_COEFFICIENTS],
+    )
 
 
 def _require_pinhole(content: Keys, key: str) -> None:

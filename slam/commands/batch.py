@@ -352,8 +352,12 @@ def _is_whole(folder: Path, arguments: list[str]) -> bool:
 
 
 def _row(outcome: Outcome) -> dict[str, Any]:
-    row: dict[str, Any] = dict.fromkeys(("drive", "status", "reason", *_COLUMNS))
-    row |= {"drive": outcome.drive.name, "status": outcome.status, "reason": outcome.reason}
+    row: dict[str, Any] = {
+        "drive": outcome.drive.name,
+        "status": outcome.status,
+        "reason": outcome.reason,
+        **dict.fromkeys(_COLUMNS),
+    }
     if outcome.status == "failed":
         return row
     metrics = RunFolder(outcome.folder).metrics()

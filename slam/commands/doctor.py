@@ -10,7 +10,7 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
-from erfsfm.common.errors import ErfsfmError
+from erfsfm.common.errors import OneLineError
 from erfsfm.inference import record_of_whole_weights
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_open3d
@@ -67,7 +67,7 @@ def _checked(part: str, describe: Callable[[], str], advice: str = "") -> str:
     """A part with its description; or why it is missing, with an ``advice``."""
     try:
         return f"ok       {part}{describe()}"
-    except (ImportError, OSError, ErfsfmError, SlamError) as error:
+    except (ImportError, OSError, OneLineError) as error:
         return f"missing  {part}: {error}{advice}"
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from erfsfm.common.errors import ErfsfmError
+from erfsfm.common.errors import OneLineError
 from erfsfm.common.files import refuse_foreign
 from erfsfm.common.progress import Progress, silent
 from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile, Pinhole
@@ -29,7 +29,7 @@ from slam.loops.verification import OF_KEYFRAMES
 from slam.mapping.occupancy import occupancy_grid, write_ros_map
 from slam.results.folder import RunFolder, check_replaced
 from slam.results.metrics import CAMERA_HEIGHTS, METRES
-from slam.runtime.errors import RunError, SlamError
+from slam.runtime.errors import RunError
 from slam.runtime.files import ESTIMATE, MAP_CLOUD, MAP_MESH, MASK, PLACES, write_atomically
 from slam.sequences.camera_file import write_camera
 from slam.sequences.recording import RecordedSequence
@@ -189,7 +189,8 @@ def _model_points(
 
     Of more than ``at_most`` those with the longest tracks are taken.
     """
-    points, sightings = np.zeros((0, 3)), Sightings.none()
+    points, none = np.zeros((0, 3)), np.zeros(0, np.intp)
+    sightings = Sightings(none, np.zeros((0, 2)), none, np.zeros(0))
     if places.views:
         structure = PlaceStructure(places, OF_KEYFRAMES)
         tracks = structure.tracks()
@@ -263,7 +264,7 @@ def _write_images(
             continue
         try:
             image = sequence.frame(row).image
-        except (SlamError, ErfsfmError):
+        except OneLineError:
             continue
         content = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
         write_atomically(output / _image_name(k), content, RunError)
@@ -304,7 +305,7 @@ def _recording(
         camera = None  # it may have moved with the images
     try:
         sequence = open_or_embedded(dataset or place, recorded.get("sequence"), camera)
-    except (SlamError, ErfsfmError) as error:
+    except OneLineError as error:
         raise RunError(
             f"the images of {folder.path} are needed and not found ({error}); give --dataset ROOT"
         ) from error

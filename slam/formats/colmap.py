@@ -6,10 +6,9 @@ COLMAP writes ``T_camera_world``, quaternions wxyz, and puts (0.5, 0.5) at the c
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,11 +41,6 @@ class Sightings:
     point: NDArray[np.intp]
     errors_px: FloatArray
 
-    @classmethod
-    def none(cls) -> Self:
-        """Of points without tracks."""
-        return cls(np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros(0, np.intp), np.zeros(0))
-
     def of_frames(self) -> dict[int, NDArray[np.intp]]:
         """The sightings of each frame that has any."""
         order = np.argsort(self.frame, kind="stable")
@@ -78,18 +72,20 @@ def write_colmap(
     width, height = intrinsics.width, intrinsics.height
     centre = intrinsics.cx + _HALF_PIXEL, intrinsics.cy + _HALF_PIXEL
     pinhole = [float(value) for value in (intrinsics.fx, intrinsics.fy, *centre)]
-    camera = [f"1 PINHOLE {width} {height} {' '.join(map(repr, pinhole))}"]
-    packed_camera = [struct.pack("<IiQQ4d", 1, _PINHOLE, width, height, *pinhole)]
-    images, packed_images = _images(T_world_camera, without_image, sightings, of_frames)
-    points, packed_points = _points(points_world, colours, sightings, of_frames)
-    counts = 1, len(images) // 2, len(points)
-    lines, parts = (camera, images, points), (packed_camera, packed_images, packed_points)
-    for name, count, text, binary in zip(MODEL_FILES, counts, lines, parts, strict=True):
-        packed = struct.pack("<Q", count) + b"".join(binary)
+    camera = f"1 PINHOLE {width} {height} {' '.join(map(repr, pinhole))}"
+    packed_camera = struct.pack("<IiQQ4d", 1, _PINHOLE, width, height, *pinhole)
+    rows = (
+        [(camera, packed_camera)],
+        _images(T_world_camera, without_image, sightings, of_frames),
+        _points(points_world, colours, sightings, of_frames),
+    )
+    for (name, header), entries in zip(_HEADERS.items(), map(list, rows), strict=True):
+        packed = struct.pack("<Q", len(entries)) + b"".join(binary for _, binary in entries)
         write_atomically(
             folder / BINARY_FOLDER / "0" / Path(name).with_suffix(".bin"), packed, RunError
         )
-        write_atomically(folder / name, "\n".join([_HEADERS[name], *text, ""]), RunError)
+        lines = [header, *(text for text, _ in entries), ""]
+        write_atomically(folder / name, "\n".join(lines), RunError)
 
 
 def _images(
@@ -97,10 +93,9 @@ def _images(
     without_image: Collection[int],
     sightings: Sightings,
     of_frames: dict[int, NDArray[np.intp]],
-) -> tuple[list[str], list[bytes]]:
+) -> Iterator[tuple[str, bytes]]:
     """Two lines an image, the second of its corners, and the same in binary form."""
     poses = translations_and_quaternions(invert(T_world_camera))[:, _QUATERNION_WXYZ_FIRST]
-    lines, parts = [], []
     for k, pose in enumerate(poses.tolist()):
         if k in without_image:
             continue
@@ -108,11 +103,10 @@ def _images(
         corners = np.empty(len(seen), [("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
         corners["x"], corners["y"] = sightings.pixels[seen].T + _HALF_PIXEL
         corners["point"] = sightings.point[seen] + 1
-        lines.append(f"{k + 1} {' '.join(map(repr, pose))} 1 {name}")
-        lines.append(" ".join(f"{x:.7g} {y:.7g} {point}" for x, y, point in corners.tolist()))
-        parts.append(struct.pack("<I7dI", k + 1, *pose, 1) + f"{name}\0".encode("ascii"))
-        parts.append(struct.pack("<Q", len(corners)) + corners.tobytes())
-    return lines, parts
+        text = " ".join(f"{x:.7g} {y:.7g} {point}" for x, y, point in corners.tolist())
+        binary = struct.pack("<I7dI", k + 1, *pose, 1) + f"{name}\0".encode("ascii")
+        binary += struct.pack("<Q", len(corners)) + corners.tobytes()
+        yield f"{k + 1} {' '.join(map(repr, pose))} 1 {name}\n{text}", binary
 
 
 def _points(
@@ -120,7 +114,7 @@ def _points(
     colours: NDArray[np.uint8],
     sightings: Sightings,
     of_frames: dict[int, NDArray[np.intp]],
-) -> tuple[list[str], list[bytes]]:
+) -> Iterator[tuple[str, bytes]]:
     """A line a point with its track: numbers of images, and of corners in them; and the same in binary form."""
     tracks: dict[int, list[tuple[int, int]]] = {}
     for frame, rows in of_frames.items():
@@ -131,15 +125,11 @@ def _points(
     sightings_of = np.bincount(sightings.point, minlength=count)
     # a point without a track has COLMAP's -1
     errors = np.where(sightings_of > 0, total / np.maximum(sightings_of, 1), -1.0)
-    lines, parts = [], []
     for k, (place, colour, error) in enumerate(
         zip(points_world.tolist(), colours.tolist(), errors.tolist()), start=1
     ):
         track = tracks.get(k - 1, [])
         numbers = " ".join(f"{x:.9g}" for x in place), " ".join(map(str, colour)), f"{error:.4g}"
-        lines.append(
-            " ".join((f"{k}", *numbers, *(f"{image} {corner}" for image, corner in track)))
-        )
+        text = " ".join((f"{k}", *numbers, *(f"{image} {corner}" for image, corner in track)))
         binary = struct.pack("<Q3d3BdQ", k, *place, *colour, error, len(track))
-        parts.append(binary + np.array(track, "<u4").tobytes())
-    return lines, parts
+        yield text, binary + np.array(track, "<u4").tobytes()

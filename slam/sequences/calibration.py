@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import re
 from dataclasses import dataclass
+from functools import partial
 from itertools import compress
 from typing import Any, Literal
 
@@ -302,10 +303,10 @@ def _fit(views: list[View], width: int, height: int, model: Model) -> Calibratio
             f"{len(views)} sharp views fit one camera, {FEWEST_VIEWS} are needed: take more images"
         )
     try:
+        fitted = partial(_fit_lens, views, width, height, model)
         if model == "fisheye":
-            return _fit_lens(views, width, height, model, _FISHEYE_FLAGS)
-        plain = _fit_lens(views, width, height, model, cv2.CALIB_FIX_K3)
-        bent = _fit_lens(views, width, height, model, 0)
+            return fitted(_FISHEYE_FLAGS)
+        plain, bent = fitted(cv2.CALIB_FIX_K3), fitted(0)
     except cv2.error as error:
         reason = " ".join(str(error.err or error).split())
         raise SlamError(

@@ -101,15 +101,14 @@ class Floor:
         number = np.arange(self._clearance.size).reshape(self._clearance.shape)
         is_clear = self._clearance >= _CLEAR_M
         length = CELL * (1.0 + 0.15 / np.maximum(self._clearance, CELL) ** 2)
-        starts, ends, lengths = [], [], []
+        edges = []
         for step in ((0, 1), (1, 0), (1, 1), (1, -1)):
             # nothing is clear at the edge, where rows and columns go round
             joined = is_clear & np.roll(is_clear, step, axis=(0, 1))
-            starts.append(number[joined])
-            ends.append(np.roll(number, step, axis=(0, 1))[joined])
-            lengths.append(np.hypot(*step) * length[joined])
-        table = np.concatenate(lengths), (np.concatenate(starts), np.concatenate(ends))
-        return coo_array(table, shape=(number.size,) * 2).tocsr()
+            other = np.roll(number, step, axis=(0, 1))
+            edges.append((np.hypot(*step) * length[joined], number[joined], other[joined]))
+        lengths, starts, ends = map(np.concatenate, zip(*edges))
+        return coo_array((lengths, (starts, ends)), shape=(number.size,) * 2).tocsr()
 
     @functools.lru_cache(maxsize=64)  # noqa: B019 - a floor lives as long as its world
     def _from(self, start: int) -> tuple[FloatArray, IntArray]:

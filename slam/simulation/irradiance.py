@@ -32,7 +32,7 @@ def irradiance_of(seed: int, some_are_dim: bool) -> Float32Array:
     surface, mesh = Surface(interior.mesh), interior.mesh
     triangles = mesh.triangles.astype(np.int64)
     count = len(mesh.vertices)
-    middle, normal = np.zeros((count, 3)), np.zeros((count, 3))
+    middle, normal = np.zeros((2, count, 3))
     uses = np.bincount(triangles.ravel(), minlength=count)[:, None]
     for corner in triangles.T:
         np.add.at(middle, corner, mesh.vertices[triangles].mean(axis=1))
@@ -42,8 +42,8 @@ def irradiance_of(seed: int, some_are_dim: bool) -> Float32Array:
     # out of the corner, off the surface
     points = mesh.vertices + 0.12 * (middle - mesh.vertices) + 0.015 * normal
     direct = np.zeros(len(points))  # the light of the lamps that are seen
-    for x, y, z, strength in lights:
-        towards = np.array([x, y, z]) - points
+    for *lamp, strength in lights:
+        towards = np.array(lamp) - points
         distance = np.linalg.norm(towards, axis=1)
         cosine = (towards * normal).sum(axis=1) / np.maximum(distance, 1e-9)
         near = np.flatnonzero((distance < _REACH_M) & (cosine > 0.0))

@@ -60,8 +60,9 @@ class SimulatedRooms(SimulatedWorld):
         camera = Intrinsics(width, height, focal_px, focal_px, *centre)
         super().__init__(options, camera, self._poses(np.arange(options.frames) / options.rate))
 
-    def _build(self) -> Mesh:
-        return self._interior.mesh
+    @functools.cached_property
+    def _still(self) -> Surface:
+        return Surface(self._interior.mesh)
 
     @functools.cached_property
     def _irradiance(self) -> Float32Array:

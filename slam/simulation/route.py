@@ -253,7 +253,12 @@ def plan_route(route: str, frames: int, seed: int, still_frames: int, variety: V
 
 def _level(points_plan: FloatArray) -> FloatArray:
     """Points ``(N, 2)`` on the road, ``(N, 3)``."""
-    return np.pad(points_plan, ((0, 0), (0, 1)))
+    return np.insert(points_plan, 2, 0.0, axis=-1)
+
+
+def _right(ahead: FloatArray) -> FloatArray:
+    """To the right of directions ``(N, 2)`` of the plan."""
+    return ahead[:, ::-1] * (1.0, -1.0)
 
 
 def _layout(
@@ -310,7 +315,7 @@ def _lane(plan: StreetPlan, seed: int) -> FloatArray:
     nodes = plan.driven
     offset = _lane_offset(plan, seed)
     ahead = unit(np.diff(nodes, axis=0))
-    right = np.stack([ahead[:, 1], -ahead[:, 0]], axis=1)
+    right = _right(ahead)
     turns = ahead[:-1, 0] * ahead[1:, 1] - ahead[:-1, 1] * ahead[1:, 0]
     sideways = np.concatenate([right, right[-1:]])
     sideways[1:-1] += right[:-1] * (np.abs(turns) > 0.5)[:, None]
@@ -323,7 +328,7 @@ def _lane(plan: StreetPlan, seed: int) -> FloatArray:
     tangent = unit(np.gradient(path, axis=0))
     drift = gaussian_filter1d(rng.standard_normal(len(path)), 14.0 / STEP)
     drift *= 0.13 / max(drift.std(), 1e-9)
-    path += np.clip(drift, -0.28, 0.28)[:, None] * np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
+    path += np.clip(drift, -0.28, 0.28)[:, None] * _right(tangent)
     return _resample(path)
 
 
@@ -386,7 +391,7 @@ def _poses(
     direction = gaussian_filter1d(np.gradient(lane_plan, axis=0), 4.0, axis=0)
     tangent = unit(se3.interpolated(sample, rows, direction))
     at, ahead = _level(se3.interpolated(sample, rows, lane_plan)), _level(tangent)
-    across = np.stack([tangent[:, 1], -tangent[:, 0], np.zeros(len(at))], axis=1)
+    across = _level(_right(tangent))
     forward = unit(bend(at + ahead) - bend(at - ahead))
     right = bend(at + across) - bend(at - across)
     right -= (right * forward).sum(axis=1, keepdims=True) * forward

@@ -136,9 +136,7 @@ class Site:
         """Add one parallelogram, textured in metres from its corner."""
         points = np.stack([[corner, corner + along], [corner + up, corner + along + up]])
         width, height = np.linalg.norm(along), np.linalg.norm(up)
-        self.patch(
-            points, np.array([[[0, 0], [width, 0]], [[0, height], [width, height]]]), instance
-        )
+        self.patch(points, lattice((0.0, width), (0.0, height)), instance)
 
     def box(
         self, low: tuple[float, ...], size: tuple[float, ...], look: int, top: int = -1
@@ -252,7 +250,8 @@ def lattice(u: ArrayLike, v: ArrayLike) -> FloatArray:
 
 def grid_over(rectangle: Rectangle, z: float, step: float) -> FloatArray:
     """Vertices over a rectangle about ``step`` metres apart, ``(R, C, 3)``."""
-    x0, y0, x1, y1 = rectangle
-    x = np.linspace(x0, x1, max(1, int((x1 - x0) / step)) + 1)
-    y = np.linspace(y0, y1, max(1, int((y1 - y0) / step)) + 1)
-    return np.pad(lattice(x, y), ((0, 0), (0, 0), (0, 1)), constant_values=z)
+    x, y = (
+        np.linspace(low, high, max(1, int((high - low) / step)) + 1)
+        for low, high in (rectangle[::2], rectangle[1::2])
+    )
+    return np.insert(lattice(x, y), 2, z, axis=-1)

@@ -51,15 +51,14 @@ class SimulatedStreet(SimulatedWorld):
         """
         size = options.width, options.height
         still = STILL_FRAMES if "stop" in options.hazards else 0
-        variety, weather = USUAL, draw_weather
+        variety, self._weather = USUAL, draw_weather(options.seed)
         if options.varied:
             variety = draw_variety(options.seed, options.route == "straight")
-            weather = draw_varied_weather
+            self._weather = draw_varied_weather(options.seed)
         self._route = plan_route(options.route, options.frames, options.seed, still, variety)
         super().__init__(options, variety.camera(*size), self._route.T_street_camera)
         self.camera_height_m = self._route.camera_height_m
         self._variety = variety
-        self._weather = weather(options.seed)
         rng = luck(options.seed, 31)
         # gain and gamma of every frame, piecewise constant
         exposures: list[list[float]] = []
@@ -98,10 +97,10 @@ class SimulatedStreet(SimulatedWorld):
             [directions[returned] * noisy[:, None], reflectance[returned]]
         ).astype(np.float32)
 
-    def _build(self) -> Mesh:
-        return build_town(
-            self._route.plan, self._route.bend, self.options.seed, self.options.varied
-        )
+    @functools.cached_property
+    def _still(self) -> Surface:
+        plan, bend = self._route.plan, self._route.bend
+        return Surface(build_town(plan, bend, self.options.seed, self.options.varied))
 
     def _moving(self, index: int) -> list[Mesh]:
         cars = self._traffic.placed(index) if self._traffic else []

@@ -152,7 +152,7 @@ class _Town:
             rim += map(edge.moved, np.arange(ROUNDING + 2.0, length - ROUNDING - 1.0, 2.5).tolist())
         outline = np.stack([spot.origin for spot in [*rim, rim[0]]])[:, :2]
         inside = np.clip(outline, [inner[0], inner[1]], [inner[2], inner[3]])
-        ring = np.pad(np.stack([outline, inside]), ((0, 0), (0, 0), (0, 1)), constant_values=KERB)
+        ring = np.insert([outline, inside], 2, KERB, axis=-1)
         self.site.patch(ring, ring[..., :2], self.pavement)
         around = se3.distance_along(outline)
         step = ring[[0, 0]].copy()

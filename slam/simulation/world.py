@@ -3,7 +3,6 @@
 Rays are cast with Open3D; surfaces have a colour where they are met.
 """
 
-import functools
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any
@@ -131,6 +130,7 @@ class SimulatedWorld(ABC):
 
     camera_height_m: float | None = None
     T_camera_lidar: FloatArray | None = None
+    _still: Surface  # every one that stands still
 
     def __init__(
         self, options: SimulationOptions, camera: Intrinsics, T_scene_camera: FloatArray
@@ -145,10 +145,6 @@ class SimulatedWorld(ABC):
         self._rays = camera.rays(camera.pixel_grid()).reshape(-1, 3).astype(np.float32)
         # ray length per depth
         self._stretch = np.linalg.norm(self._rays, axis=1).astype(np.float32)
-
-    @abstractmethod
-    def _build(self) -> Mesh:
-        """Every surface that stands still."""
 
     @abstractmethod
     def _moving(self, index: int) -> list[Mesh]:
@@ -220,10 +216,6 @@ class SimulatedWorld(ABC):
     def scan(self, index: int) -> Float32Array:
         """LiDAR points of a frame ``(M, 4)``: x, y, z in the LiDAR, metres, and reflectance."""
         raise NotImplementedError(f"frame {index}: this world has no LiDAR")
-
-    @functools.cached_property
-    def _still(self) -> Surface:
-        return Surface(self._build())
 
     def _surfaces(self, index: int) -> list[Surface]:
         """The surfaces at a frame: what stands still, and what moves."""

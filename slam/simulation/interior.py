@@ -35,8 +35,8 @@ class Room:
 
     def contains(self, points: FloatArray) -> NDArray[np.bool_]:
         """Which points of the plan ``(N, 2)`` are inside, ``(N,)``."""
-        x0, y0, x1, y1 = self.area
-        return np.asarray(((points > (x0, y0)) & (points < (x1, y1))).all(axis=1))
+        low, high = self.area[:2], self.area[2:]
+        return np.asarray(((points > low) & (points < high)).all(axis=1))
 
 
 def draw_plan(seed: int) -> tuple[list[Room], list[Rectangle]]:
@@ -186,8 +186,8 @@ class Interior:
 
     def _place(self, piece: Piece, place: Site, width: float) -> None:
         depth = piece(place, width)
-        corners = np.stack([place.origin, place.moved(width, depth).origin])
-        self.obstacles.append((*corners.min(axis=0)[:2], *corners.max(axis=0)[:2]))
+        corners = np.sort([place.origin, place.moved(width, depth).origin], axis=0)
+        self.obstacles.append((*corners[0, :2], *corners[1, :2]))
 
     def _hang(self, place: Site, width: float) -> None:
         """A picture or a mirror at the height of the eyes."""

@@ -18,6 +18,7 @@ from slam.simulation.options import StreetKind, Variety
 Node = tuple[int, int]
 BoolArray = NDArray[np.bool_]
 
+STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))  # from a node to its neighbours
 KERB = 0.13  # height of pavements above the road, metres
 STEP = 0.25  # between samples of a path in the plan, metres
 OVERLAP = 67.0  # length of the start that a loop drives again, metres
@@ -76,7 +77,7 @@ def loop_cycle(rng: np.random.Generator, edges: int) -> list[Node]:
         cells = {(0, 0)}
         while len(outline := _outline(cells)) < edges:
             x, y = sorted(cells)[rng.integers(len(cells))]
-            dx, dy = ((1, 0), (-1, 0), (0, 1), (0, -1))[rng.integers(4)]
+            dx, dy = STEPS[rng.integers(4)]
             cells.add((x + dx, y + dy))
         cycle = _trace(outline) if len(outline) == edges else None
         if cycle is None:
@@ -105,10 +106,8 @@ def grid_walk(rng: np.random.Generator, side: int, edges: int, spare: int) -> li
         walk = [(int(rng.integers(side)), int(rng.integers(side)))]
         while len(walk) <= edges + spare:
             x, y = walk[-1]
-            steps = [(x + 1, y), (x - 1, y), (x, y + 1), (x, y - 1)]
-            steps = [
-                s for s in steps if 0 <= s[0] < side and 0 <= s[1] < side and s not in walk[-2:-1]
-            ]
+            steps = [(x + dx, y + dy) for dx, dy in STEPS]
+            steps = [s for s in steps if min(s) >= 0 and max(s) < side and s not in walk[-2:-1]]
             walk.append(steps[rng.integers(len(steps))])
         driven: set[tuple[Node, Node]] = set()
         same = opposite = 0

@@ -38,11 +38,10 @@ def _palettes() -> Any:
 @functools.lru_cache(maxsize=256)
 def _patch_triangles(rows: int, columns: int) -> IntArray:
     """Triangles of a grid of vertices, wound so that (column, row) is right-handed, ``(T, 3)``."""
-    index = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = (
-        part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1])
-    )
-    return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    corner = np.arange(rows * columns).reshape(rows, columns)[:-1, :-1].reshape(-1, 1)
+    opposite = corner + columns + 1
+    halves = [corner, corner + 1, opposite], [corner, opposite, opposite - 1]
+    return np.concatenate([np.hstack(half) for half in halves])
 
 
 class Site:

@@ -8,7 +8,7 @@ from slam.geometry import se3
 from slam.simulation import objects
 from slam.simulation.geometry import Bend, Mesh, luck
 from slam.simulation.open_land import open_land
-from slam.simulation.route import KERB, Node, StreetPlan
+from slam.simulation.route import KERB, STEPS, Node, StreetPlan
 from slam.simulation.shapes import Rectangle, Site, grid_over, lattice
 
 LANE = 3.6  # width on a motorway, metres
@@ -89,8 +89,7 @@ class _Town:
                     self._corridor((x + half, y - half, xs[i + 1] - half, y + half), (i, j))
                 if j + 1 < len(ys):
                     self._corridor((x - half, y + half, x + half, ys[j + 1] - half), (i, j), True)
-                neighbours = [(i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)]
-                crossed = any(self.plan.is_street((i, j), other) for other in neighbours)
+                crossed = any(self.plan.is_street((i, j), (i + di, j + dj)) for di, dj in STEPS)
                 rectangle = (x - half, y - half, x + half, y + half)
                 if not crossed:
                     self._slab(rectangle, KERB, self.grass)
@@ -207,8 +206,8 @@ class _Town:
             self._split((x0, y0, x, y), inner, sides)
             self._split((x, y0, x1, y1) if width > depth else (x0, y, x1, y1), inner, sides)
             return
-        touches = (y0 == inner[1], x1 == inner[2], y1 == inner[3], x0 == inner[0])
-        self._lot(lot, [k for k in range(4) if touches[k] and sides[k]])
+        touches = np.roll(np.equal(lot, inner), -1)
+        self._lot(lot, np.flatnonzero(touches & sides).tolist())
 
     def _lot(self, lot: Rectangle, facing: list[int]) -> None:
         """Build on a lot, or leave it open.

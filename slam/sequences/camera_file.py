@@ -387,8 +387,7 @@ class Undistortion:
         )
         pixels = self.intrinsics.pixel_grid()
         seen = self.distort(pixels.reshape(-1, 2), self.intrinsics.K).astype(np.float32)
-        map_u, map_v = cv2.split(seen.reshape(pixels.shape))
-        self._maps = map_u, map_v
+        self._maps = cv2.split(seen.reshape(pixels.shape))
 
     def apply(self, image: Image) -> Image:
         """Undistort an image ``(H, W, 3)``.

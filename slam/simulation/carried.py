@@ -62,16 +62,13 @@ class Floor:
         _, part = connected_components(self._graph, directed=False)
         roomy = self._clearance.ravel() >= _PLACE_CLEAR_M
         roomy &= part == np.bincount(part).argmax()
-        chosen: list[int] = []
-        rooms: list[int] = []
-        for number, room in enumerate(interior.rooms):  # up to five places a room
+        chosen = []
+        for room in interior.rooms:  # up to five places a room
             inside = np.flatnonzero(roomy & room.contains(self._centres))
-            found = rng.choice(inside, min(len(inside), 5), replace=False)
-            chosen.extend(found)
-            rooms.extend([number] * len(found))
-        self.places = self._centres[chosen]
-        self.room = np.array(rooms)
-        self._at = np.array(chosen)
+            chosen.append(rng.choice(inside, min(len(inside), 5), replace=False))
+        self._at = np.concatenate(chosen)
+        self.places = self._centres[self._at]
+        self.room = np.repeat(np.arange(len(chosen)), list(map(len, chosen)))
 
     def clearance(self, points: FloatArray) -> FloatArray:
         """Distance in plan from points ``(M, 2)`` to what stands there, metres, ``(M,)``."""

@@ -402,7 +402,7 @@ def _poses(
     slow = gaussian_filter1d(white, 8.0, axis=0) * np.sqrt(3.54 * 8.0)
     fast = gaussian_filter1d(white, 2.0, axis=0) * np.sqrt(3.54 * 2.0)
     mixed = (0.8 * slow + 0.6 * fast)[30:-30]
-    sizes = np.array([np.deg2rad(0.3), np.deg2rad(0.2), np.deg2rad(0.3), 0.012])
+    sizes = np.array([*np.deg2rad([0.3, 0.2, 0.3]), 0.012])
     suspension = np.clip(mixed, -2.2, 2.2) * sizes
     # nobody mounts a camera level
     suspension[:, 0] += np.deg2rad(rng.uniform(-0.8, 0.8)) - variety.pitch

@@ -303,9 +303,9 @@ def placed_errors(distances: MapDistances) -> dict[str, Any]:
         of_surface = (distances.surface_range >= from_m) & (distances.surface_range < to_m)
         ring = _errors(own[of_map], true[of_surface], _LEAST_IN_BIN)
         counts = {"map_points": int(of_map.sum()), "surface_points": int(of_surface.sum())}
-        curve.append(SurfaceMetrics.of(from_m=from_m, to_m=to_m, **ring, **counts))
+        curve.append({"from_m": from_m, "to_m": to_m} | ring | counts)
     share = _share(in_field) if len(in_field) else _NO_MAP
-    fair = SurfaceMetrics.of(**_errors(own[in_field], true[near], 1), share=share)
+    fair = _errors(own[in_field], true[near], 1) | {"share": share}
     return _errors(own, true[near], 1) | {"in_field": fair, "by_distance": curve}
 
 
@@ -313,31 +313,26 @@ def _errors(own: FloatArray, true: FloatArray, least: int) -> dict[str, Any]:
     """Accuracy, completeness and F-scores of distances from the map and to it, missing below ``least`` points."""
     no_map = (_NO_MAP if least == 1 else _FEW) if len(own) < least else None
     no_surface = (_NO_SURFACE if least == 1 else _FEW) if len(true) < least else None
-    precision = {key: no_map or _share(own <= within) for key, within in F_SCORES_M.items()}
-    recall = {key: no_surface or _share(true <= within) for key, within in F_SCORES_M.items()}
+    precision: dict[str, Any] = {}
+    recall: dict[str, Any] = {}
+    f_score: dict[str, Any] = {}
+    for key, within in F_SCORES_M.items():
+        p = precision[key] = no_map or _share(own <= within)
+        r = recall[key] = no_surface or _share(true <= within)
+        f_score[key] = no_map or no_surface or 2 * p * r / (p + r or 1.0)
     return {
         "accuracy_median_m": no_map or median(own),
         "accuracy_90_m": no_map or float(np.quantile(own, 0.9)),
         "outlier_share": no_map or _share(own > OUTLIER_M),
         "completeness": no_surface or _share(true <= COVERED_WITHIN_M),
-        "f_score": Within.of(
-            **{key: _harmonic_mean(precision[key], recall[key]) for key in F_SCORES_M}
-        ),
-        "precision": Within.of(**precision),
-        "recall": Within.of(**recall),
+        "f_score": f_score,
+        "precision": precision,
+        "recall": recall,
     }
 
 
 def _share(which: Mask) -> float:
     return float(which.mean())
-
-
-def _harmonic_mean(precision: float | Failed, recall: float | Failed) -> float | Failed:
-    if isinstance(precision, Failed):
-        return precision
-    if isinstance(recall, Failed):
-        return recall
-    return 2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0
 
 
 def _sampled(points: FloatArray, candidates: Indices) -> Indices:

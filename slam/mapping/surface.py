@@ -354,8 +354,7 @@ def _is_small_and_flat(corners: FloatArray, up_world: FloatArray, largest_m: flo
     """
     if 2 * float(np.linalg.norm(corners, axis=1).max()) > largest_m:
         return False
-    (x, y, z), (u, v, w) = corners.T, corners[[*range(1, len(corners)), 0]].T
-    area = 0.5 * np.array([y @ w - z @ v, z @ u - x @ w, x @ v - y @ u])
+    area = 0.5 * np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)
     size = length_of(area)
     if size == 0 or float(-area @ up_world) < _UPWARDS * size:
         return False

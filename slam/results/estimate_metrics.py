@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 from scipy.special import chdtri, fdtri
@@ -43,6 +44,7 @@ _BY_MAPS = Failed("maps of keyframes give the poses, not steps from frame to fra
 _NOTHING_FIXED = Failed(
     "nothing was found that is fixed to the camera, or too few images moved to find it"
 )
+_STANDS_STILL = Failed("the estimate does not move: the truth cannot be scaled to it")
 _NO_MAP_YET = Failed("the run ended before its map was whole")
 
 
@@ -62,7 +64,7 @@ def estimate_metrics(
         motion=_motion(result),
         timing=timing_of(result.stopwatch, len(sequence)),
         scale=_scale(result),
-        agreement=[records.AgreementMetrics(**asdict(each)) for each in result.agreements],
+        agreement=[*result.agreements],
         confidence=records.ConfidenceMetrics.of(
             run=result.confidence,
             shape=result.shape,
@@ -120,7 +122,7 @@ def _sequence(result: Estimate, sequence: FrameSequence) -> records.SequenceMetr
         bridged=_stretches(drive.interpolated),
         doubled=_stretches(dict.fromkeys(drive.doubled, DOUBLED)),
         unreadable_scans=_stretches(scans),
-        segments=[records.Stretch(**asdict(segment)) for segment in drive.segments],
+        segments=[*drive.segments],
         fixed_share=_NOTHING_FIXED
         if drive.measured.fixed is None
         else float(drive.measured.fixed.mean()),
@@ -187,19 +189,15 @@ def _graph(result: Estimate) -> records.GraphMetrics:
     """Size of the graph, and coverage of its noise by the truth at the graph's scale."""
     if isinstance(result.graph, Failed):
         return records.GraphMetrics.unknown(result.graph.reason)
-    nodes, factors = len(result.optimised), result.graph.relative_poses
-    if result.reference is None:
-        return records.GraphMetrics.of(nodes=nodes, factors=len(factors), coverage=_NO_TRUTH)
-    aligned = umeyama(result.optimised.positions, result.reference.positions, with_scale=True)
-    if not aligned.scale > 0:
-        still = Failed("the estimate does not move: the truth cannot be scaled to it")
-        return records.GraphMetrics.of(nodes=nodes, factors=len(factors), coverage=still)
-    covered = coverage(factors, result.reference.T_world_camera, aligned.scale)
-    by_source = {source: records.CoverageMetrics.of(**shares) for source, shares in covered.items()}
-    overall = by_source.pop("")
-    return records.GraphMetrics(
-        nodes=nodes, factors=len(factors), coverage=overall, coverage_by_source=by_source
-    )
+    factors = result.graph.relative_poses
+    held: dict[str, Any] = {"coverage": _NO_TRUTH}
+    if result.reference is not None:
+        aligned = umeyama(result.optimised.positions, result.reference.positions, with_scale=True)
+        held = {"coverage": _STANDS_STILL}
+        if aligned.scale > 0:
+            by_source = coverage(factors, result.reference.T_world_camera, aligned.scale)
+            held = {"coverage": by_source.pop(""), "coverage_by_source": by_source}
+    return records.GraphMetrics.of(nodes=len(result.optimised), factors=len(factors), **held)
 
 
 def coverage(
@@ -227,10 +225,9 @@ def coverage(
     sources = np.array([edge.source for edge in relative_poses])
     found = {"": {level: float(within.mean()) for level, within in inside.items()}}
     for source in np.unique(sources):
-        ratios = {
-            level: float(within[sources == source].mean()) for level, within in inside.items()
-        }
-        found[str(source)] = {"factors": int((sources == source).sum()), **ratios}
+        own = sources == source
+        ratios = {level: float(within[own].mean()) for level, within in inside.items()}
+        found[str(source)] = {"factors": int(own.sum()), **ratios}
     return found
 
 
@@ -269,11 +266,11 @@ def _tracking(result: Estimate) -> records.TrackingMetrics | Failed:
     drive = result.drive
     if not drive.by_keyframes:
         return Failed("this drive has no map of keyframes: it is measured from step to step")
-    return records.TrackingMetrics(
+    return records.TrackingMetrics.of(
         keyframes=sum(len(segment.keyframes) for segment in drive.measured.maps),
         maps=len(set(drive.map_poses.component.values())),
         located_frames=len(drive.map_poses.segments),
-        events=[records.Event(**asdict(event)) for event in drive.events],
+        events=[*drive.events],
     )
 
 

@@ -213,17 +213,10 @@ def motion_figure(
         figure.add_trace(_line(name, seconds, speed, frames, "%{y:.3f} at %{x:.1f} s"), 1, 1)
     angles = np.unwrap(Rotation.from_matrix(last.T_world_camera[:, :3, :3]).as_euler("YXZ"), axis=0)
     for name, colour, values in zip(("Yaw", "Pitch", "Roll"), COLOURS[1:], np.rad2deg(angles).T):
-        words = f"frame %{{customdata}}: {name} %{{y:.2f}} deg at %{{x:.1f}} s<extra></extra>"
-        line = {
-            "name": name,
-            "line": {"color": colour, "width": 1.6},
-            "hovertemplate": words,
-            "mode": "lines",
-        }
         frames, seconds = _frames(last, drawn), last.stamps - last.stamps[0]
-        figure.add_trace(
-            go.Scatter(x=_single(seconds), y=_single(values), customdata=frames, **line), 2, 1
-        )
+        look = {"line": {"color": colour, "width": 1.6}}
+        line = _line(name, seconds, values, frames, "%{y:.2f} deg at %{x:.1f} s", **look)
+        figure.add_trace(line, 2, 1)
     return _over_time(figure, last, gaps)
 
 

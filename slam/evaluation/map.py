@@ -93,14 +93,14 @@ class SurfaceTruth:
 
     ``name`` says what it is, ``frames`` ``(F,)`` which frames measured the surface, ``view`` gives the surface as one
     of them measured it. ``in_field`` says whether the sensor could have measured points ``(P, 3)`` from any of some
-    frames that were viewed, if nothing hid them. ``distance``, where the surface is known exactly, gives the distances
-    ``(P,)`` of points ``(P, 3)`` to it.
+    frames that were viewed, if nothing hid them; by default it could. ``distance``, where the surface is known exactly,
+    gives the distances ``(P,)`` of points ``(P, 3)`` to it.
     """
 
     name: str
     frames: Indices
     view: Callable[[int], Surface]
-    in_field: Callable[[FloatArray, Indices], Mask]
+    in_field: Callable[[FloatArray, Indices], Mask] = lambda points, _: np.ones(len(points), bool)
     distance: Callable[[FloatArray], FloatArray] | None = None
 
 
@@ -149,18 +149,18 @@ def accumulated(truth: SurfaceTruth, views: Indices, positions: FloatArray) -> S
     """
     margin = RANGE_M + _BEYOND_M
     low, high = positions.min(axis=0) - margin, positions.max(axis=0) + margin
-    surface = Surface(np.empty((0, 3)), np.empty(0, dtype=bool))
-    waiting: list[Surface] = []
+    surfaces = [Surface(np.empty((0, 3)), np.empty(0, dtype=bool))]  # the first is thinned
     for number, frame in enumerate(views, 1):
         view = truth.view(int(frame))
         inside = ((view.points >= low) & (view.points <= high)).all(axis=1)
-        waiting.append(Surface(view.points[inside], view.in_image[inside]))
-        if number == len(views) or sum(len(each.points) for each in waiting) > _WAITING_POINTS:
-            points = np.concatenate([surface.points, *(each.points for each in waiting)])
-            in_image = np.concatenate([surface.in_image, *(each.in_image for each in waiting)])
+        surfaces.append(Surface(view.points[inside], view.in_image[inside]))
+        waiting = sum(len(each.points) for each in surfaces[1:])
+        if number == len(views) or waiting > _WAITING_POINTS:
+            points = np.concatenate([each.points for each in surfaces])
+            in_image = np.concatenate([each.in_image for each in surfaces])
             chosen = thinned(points, TRUTH_VOXEL_M, np.argsort(~in_image, kind="stable"))
-            surface, waiting = Surface(points[chosen], in_image[chosen]), []
-    return surface
+            surfaces = [Surface(points[chosen], in_image[chosen])]
+    return surfaces[0]
 
 
 def backprojected(

@@ -164,25 +164,18 @@ class MergedSubmaps:
         Coordinates ``(B, 3)``, distances ``(B, 4096)`` in truncation distances, and weights ``(B, 4096)``.
         """
         inside = [np.asarray(((keys >= low) & (keys < high)).all(axis=1)) for keys in self._keys]
-        keys = np.unique(
-            np.concatenate([own[mask] for own, mask in zip(self._keys, inside)]), axis=0
-        )
+        parts = [own[mask] for own, mask in zip(self._keys, inside)]
+        keys, rows = np.unique(np.concatenate(parts), axis=0, return_inverse=True)
         weight = np.zeros((len(keys), BLOCK_VOXELS), np.float32)
         total = np.zeros_like(weight)
-
-        def cells(of_blocks: Keys) -> NDArray[np.intp]:
-            return np.ravel_multi_index(tuple((of_blocks - low).T), tuple(high - low))
-
-        cells_of_all = cells(keys)
-        for number, mask in enumerate(inside):
-            if not mask.any():
+        ends = np.cumsum([len(part) for part in parts])
+        for number, own_rows in enumerate(np.split(rows.ravel(), ends[:-1])):
+            if not len(own_rows):
                 continue
-            submap = self.read(number)
-            # where each block of the submap is among all of them: the numbers of their cells are sorted as their keys
-            rows = np.searchsorted(cells_of_all, cells(self._keys[number][mask]))
+            submap, mask = self.read(number), inside[number]
             own = submap.weight[mask].astype(np.float32)
-            weight[rows] += own
-            total[rows] += own * submap.tsdf[mask]
+            weight[own_rows] += own
+            total[own_rows] += own * submap.tsdf[mask]
         np.divide(total, weight, out=total, where=weight > 0)
         return keys, total, weight
 

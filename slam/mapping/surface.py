@@ -216,12 +216,11 @@ def _numbered(
         numbers = np.full(len(own), -1)
         groups = group[place : place + len(piece.shared)]
         is_first = earliest[groups] == np.arange(place, place + len(groups))
-        other, firsts = piece.shared[~is_first], piece.shared[is_first]
-        own[other] = False
+        own[piece.shared[~is_first]] = False
         count = int(np.count_nonzero(own))
         numbers[own] = np.arange(written, written + count)
-        row_of_group[groups[is_first]] = numbers[firsts]
-        numbers[other] = row_of_group[groups[~is_first]]
+        row_of_group[groups[is_first]] = numbers[piece.shared[is_first]]
+        numbers[piece.shared] = row_of_group[groups]
         rows.append((spill.put(numbers), written))
         triangles += int(piece.sizes[kept_part[first:last]].sum())
         place, written = place + len(groups), written + count

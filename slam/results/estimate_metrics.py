@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtri, fdtri
+from scipy.special import fdtri
 
 from erfsfm.evaluation.pose_metrics import (
     SnippetErrors,
@@ -38,6 +37,7 @@ from slam.runtime.stopwatch import Stopwatch
 
 LEVELS = (50, 90, 95)  # per cent of the factors that the bounds of their stated noise hold
 _NO_TRUTH = Failed("the sequence has no true poses")
+_NORMAL_DOF = 1e12  # whose F is a chi-square over its degrees of freedom, to 1e-11
 _TOP_SPEED_S = 1.0  # steps alone are noisy
 _NO_HEIGHTS = Failed("the GPS track has no altitudes")
 _BY_MAPS = Failed("maps of keyframes give the poses, not steps from frame to frame")
@@ -137,15 +137,15 @@ def _motion(result: Estimate) -> records.MotionMetrics:
     begins = seconds[seconds <= seconds[-1] - window]
     ahead = np.interp(begins + window, seconds, path) - path[: len(begins)]
     drive = result.drive
-    stills = (
-        ends for ends, each in drive.steps.items() if each.relative_pose.source == STILL_SOURCE
+    standing = sum(
+        each.relative_pose.source == STILL_SOURCE and to - start == 1
+        for (start, to), each in drive.steps.items()
     )
-    steps = {ends for ends in stills if ends[1] - ends[0] == 1}
     return records.MotionMetrics.of(
         path=float(path[-1]),
         mean_speed=float(path[-1] / span),
         top_speed=float(ahead.max() / window),
-        standing_share=len(steps) / (len(path) - 1) if drive.support is not None else _BY_MAPS,
+        standing_share=standing / (len(path) - 1) if drive.support is not None else _BY_MAPS,
     )
 
 
@@ -235,11 +235,10 @@ def squared_bound(probability: float, student_t_dof: float) -> float:
     """Quantile of the whitened squared error of six numbers.
 
     For errors by Student's t with ``student_t_dof`` degrees of freedom, whose standard deviations are the sigmas: a
-    quantile of Fisher's F. For normal errors (infinite ``student_t_dof``): a quantile of chi-square.
+    quantile of Fisher's F. For normal errors (infinite ``student_t_dof``) that is one of chi-square.
     """
-    if math.isinf(student_t_dof):
-        return float(chdtri(6, 1.0 - probability))
-    return float(6 * (student_t_dof - 2) / student_t_dof * fdtri(6, student_t_dof, probability))
+    dof = min(student_t_dof, _NORMAL_DOF)
+    return float(6 * (dof - 2) / dof * fdtri(6, dof, probability))
 
 
 def _loops(found: LoopClosures) -> records.LoopMetrics:

@@ -317,8 +317,9 @@ def _errors(own: FloatArray, true: FloatArray, least: int) -> dict[str, Any]:
     recall: dict[str, Any] = {}
     f_score: dict[str, Any] = {}
     for key, within in F_SCORES_M.items():
-        p = precision[key] = no_map or _share(own <= within)
-        r = recall[key] = no_surface or _share(true <= within)
+        p: Any = no_map or _share(own <= within)
+        r: Any = no_surface or _share(true <= within)
+        precision[key], recall[key] = p, r
         f_score[key] = no_map or no_surface or 2 * p * r / (p + r or 1.0)
     return {
         "accuracy_median_m": no_map or median(own),

@@ -257,9 +257,9 @@ def _joined(first: Image, second: Image, ends: NDArray[np.floating]) -> Image:
     joined = np.ascontiguousarray(np.vstack([left, right]) if wide else np.hstack([left, right]))
     shift = np.array([[0, 0], [0, left.shape[0]] if wide else [_WIDTH_PX, 0]])
     ends = (ends + shift)[:: max(1, -(-len(ends) // _MOST_LINES))]
-    for line, colour in zip(np.rint(ends).astype(int).tolist(), cycle(_LINES)):
-        cv2.line(joined, *line, colour, 1, cv2.LINE_AA)
-        for place in line:
+    for (start, end), colour in zip(np.rint(ends).astype(int).tolist(), cycle(_LINES)):
+        cv2.line(joined, start, end, colour, 1, cv2.LINE_AA)
+        for place in (start, end):
             cv2.circle(joined, place, 2, colour, 1, cv2.LINE_AA)
     return joined
 

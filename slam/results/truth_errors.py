@@ -80,7 +80,7 @@ def lidar_truth(
     images; the accuracy of the map is measured against all. In the field are points within 25 m of a scanner, between
     its lowest and its highest beam.
     """
-    limits: dict[int, tuple[float, float]] = {}  # sines of the lowest and the highest beam
+    limits: dict[int, FloatArray] = {}  # sines of the lowest and the highest beam
 
     def view(frame: int) -> Surface:
         points = readable_scan(sequence, frame)
@@ -89,8 +89,8 @@ def lidar_truth(
         ranges = np.linalg.norm(points, axis=1)
         sines = points[ranges > 1.0, 2] / ranges[ranges > 1.0]
         # stray points left out
-        beams = np.quantile(sines, [0.001, 0.999]) if len(sines) else (1.0, -1.0)
-        limits[frame] = float(beams[0]), float(beams[1])
+        known = len(sines) > 0
+        limits[frame] = np.quantile(sines, [0.001, 0.999]) if known else np.array([1.0, -1.0])
         points = apply(T_camera_lidar, points[ranges <= RANGE_M])
         return Surface(apply(reference[frame], points), _in_image(points, sequence.intrinsics))
 

@@ -210,9 +210,8 @@ def motion_figure(
     angles = np.unwrap(Rotation.from_matrix(last.T_world_camera[:, :3, :3]).as_euler("YXZ"), axis=0)
     for name, colour, values in zip(("Yaw", "Pitch", "Roll"), COLOURS[1:], np.rad2deg(angles).T):
         frames, seconds = _frames(last, drawn), last.stamps - last.stamps[0]
-        look = {"line": {"color": colour, "width": 1.6}}
-        line = _line(name, seconds, values, frames, "%{y:.2f} deg at %{x:.1f} s", **look)
-        figure.add_trace(line, 2, 1)
+        words, look = "%{y:.2f} deg at %{x:.1f} s", {"color": colour, "width": 1.6}
+        figure.add_trace(_line(name, seconds, values, frames, words, line=look), 2, 1)
     return _over_time(figure, last, gaps)
 
 

@@ -27,8 +27,6 @@ from slam.mapping.map import TsdfMap
 from slam.runtime.errors import Failed
 from slam.runtime.stopwatch import Stopwatch
 
-# relative sigma of learned depth in rooms, in the unit of the drive: 90 % of the errors are within 1.645 sigmas
-_ROOM_SIGMA = 0.32
 _SOME = 20
 _STREET_DEPTH_M = 15.0  # median depth of a street
 

@@ -72,13 +72,8 @@ def chain_odometry(factors: Sequence[RelativePose], count: int) -> FloatArray:
             first. Of several that are equally good and long, the last one is taken.
         count: frames.
     """
-    arriving: dict[int, RelativePose] = {}
-    for factor in factors:
-        first, last = factor.ends
-        if first < last and (
-            last not in arriving or _precedence(factor) >= _precedence(arriving[last])
-        ):
-            arriving[last] = factor
+    by_precedence = sorted(factors, key=_precedence)
+    arriving = {each.to_index: each for each in by_precedence if each.from_index < each.to_index}
     T_world_camera = np.tile(np.eye(4), (count, 1, 1))
     T_from_to = rigid(np.array([arriving[k].T_from_to for k in range(1, count)]).reshape(-1, 4, 4))
     for k, T_first_camera in enumerate(T_from_to, start=1):

@@ -254,7 +254,7 @@ def _loops(found: LoopClosures) -> records.LoopMetrics:
         )
     rejected = found.rejected[:MOST_REJECTED]
     ends = [
-        records.LoopEnds.of(from_=each.from_index, to=each.to_index, reason=each.reason)
+        records.LoopEnds.of(from_=each.ends[0], to=each.ends[1], reason=each.reason)
         for each in rejected
     ]
     return records.LoopMetrics.of(**counts, rejected=ends)

@@ -115,7 +115,7 @@ def occupancy_grid(
     ground_at = ground_along(mesh.points, T_world_camera, _USUAL_CAMERA_HEIGHT_M * metre)
     grid = Grid.around(mesh.points, resolution)
     shape = (grid.height, grid.width)
-    free, occupied = np.zeros(shape).ravel(), np.zeros(shape).ravel()
+    free, occupied = np.zeros((2, grid.height * grid.width))
     for points, areas in samples(mesh, resolution):
         cells = grid.cells(points)
         touched, which = np.unique(cells, return_inverse=True)

@@ -215,9 +215,8 @@ class SlamPipeline:
         camera = self.sequence.intrinsics.resized(width, height)
         guess_sigma = _ROOM_SIGMA if drive.by_keyframes and config.depth.is_learned else None
         depth_at = keyframe_depths(drive, scales, T_world_camera, camera, self._decide, guess_sigma)
-        mapping = config.mapping
-        if not estimate.scale.is_metric:
-            mapping = fitted(mapping, drive, scales)
+        is_metric, mapping = estimate.scale.is_metric, config.mapping
+        mapping = mapping if is_metric else fitted(mapping, drive, scales)
         tsdf_map = TsdfMap(mapping, camera)
         T_keyframes = T_world_camera[[keyframe.index for keyframe in drive.keyframes]]
         selected = moved_rows(T_keyframes, mapping.keyframe_distance_m, _KEYFRAME_ROTATION_DEG)

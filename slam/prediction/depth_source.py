@@ -179,9 +179,7 @@ def at_size(disparity: Disparity, height: int, width: int) -> Disparity:
         cv2.resize(part.astype(np.float32), (width, height), interpolation=method)
         for part in (known, np.where(known, disparity, 0))
     )
-    return np.where(weight >= least, total / np.maximum(weight, least), np.float32(np.nan)).astype(
-        np.float32
-    )
+    return np.where(weight >= least, total / np.maximum(weight, least), np.float32(np.nan))
 
 
 def _affine(

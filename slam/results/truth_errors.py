@@ -89,8 +89,7 @@ def lidar_truth(
         ranges = np.linalg.norm(points, axis=1)
         sines = points[ranges > 1.0, 2] / ranges[ranges > 1.0]
         # stray points left out
-        known = len(sines) > 0
-        limits[frame] = np.quantile(sines, [0.001, 0.999]) if known else np.array([1.0, -1.0])
+        limits[frame] = np.quantile(sines, [0.001, 0.999]) if len(sines) else np.array([1.0, -1.0])
         points = apply(T_camera_lidar, points[ranges <= RANGE_M])
         return Surface(apply(reference[frame], points), _in_image(points, sequence.intrinsics))
 

@@ -387,7 +387,8 @@ class Undistortion:
         )
         pixels = self.intrinsics.pixel_grid()
         seen = self.distort(pixels.reshape(-1, 2), self.intrinsics.K).astype(np.float32)
-        self._maps = cv2.split(seen.reshape(pixels.shape))
+        map_u, map_v = cv2.split(seen.reshape(pixels.shape))
+        self._maps = map_u, map_v
 
     def apply(self, image: Image) -> Image:
         """Undistort an image ``(H, W, 3)``.

@@ -134,7 +134,7 @@ class Site:
     def quad(self, corner: FloatArray, along: FloatArray, up: FloatArray, instance: int) -> None:
         """Add one parallelogram, textured in metres from its corner."""
         points = np.stack([[corner, corner + along], [corner + up, corner + along + up]])
-        width, height = np.linalg.norm(along), np.linalg.norm(up)
+        width, height = (float(np.linalg.norm(side)) for side in (along, up))
         self.patch(points, lattice((0.0, width), (0.0, height)), instance)
 
     def box(

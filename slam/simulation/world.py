@@ -130,7 +130,6 @@ class SimulatedWorld(ABC):
 
     camera_height_m: float | None = None
     T_camera_lidar: FloatArray | None = None
-    _still: Surface  # every one that stands still
 
     def __init__(
         self, options: SimulationOptions, camera: Intrinsics, T_scene_camera: FloatArray
@@ -145,6 +144,11 @@ class SimulatedWorld(ABC):
         self._rays = camera.rays(camera.pixel_grid()).reshape(-1, 3).astype(np.float32)
         # ray length per depth
         self._stretch = np.linalg.norm(self._rays, axis=1).astype(np.float32)
+
+    @property
+    @abstractmethod
+    def _still(self) -> Surface:
+        """Every surface that stands still."""
 
     @abstractmethod
     def _moving(self, index: int) -> list[Mesh]:

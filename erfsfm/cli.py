@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import shlex
 import sys
 from dataclasses import asdict
@@ -82,6 +81,7 @@ def train(
     Example: erfsfm-slam simulate worlds/0 --depth && erfsfm train --config tiny --dataset worlds/0 --output runs/toy
     """
     from erfsfm.config import UNTRAINED, load_experiment
+    from erfsfm.training.output_folder import how_good
     from erfsfm.training.run import depth_before_and_after
     from erfsfm.training.run import prepare as prepare_training
     from erfsfm.training.run import train as run_training
@@ -97,7 +97,7 @@ def train(
             return
         folder = run_training(experiment, output, resume, device, _command(), progress, camera)
         typer.echo(f"weights in {folder}: use them with --weights {folder}")
-        typer.echo(_how_good(folder))
+        typer.echo(how_good(folder))
         if experiment.initial_weights in UNTRAINED or experiment.data.validation_share == 0:
             return
         try:
@@ -106,28 +106,6 @@ def train(
             logger.warning("depth before and after training was not compared: %s", error)
             return
     print_rows(rows, as_json=False)
-
-
-def _how_good(folder: Path) -> str:
-    """What the last validation measured, and the command that measures the weights on other data."""
-    from erfsfm.model_record import read_record
-
-    record = read_record(folder / "model.yaml")
-    units = {
-        "abs_rel": "AbsRel {:.3f}",
-        "snippet_ate": "snippet ATE {:.4f} m",
-        "photometric": "photometric error {:.4f}",
-    }
-    measured = [
-        text.format(record.metrics[key])
-        for key, text in units.items()
-        if math.isfinite(record.metrics.get(key, math.nan))
-    ]
-    kind, data = ("pose", "KITTI --sequence 09") if record.networks == "pose" else ("depth", "ROOT")
-    said = f"validation: {', '.join(measured)}" if measured else "they were not validated"
-    return (
-        f"{said}; errors on other data: erfsfm evaluate {kind} --weights {folder} --dataset {data}"
-    )
 
 
 @app.command("train-fusion")
@@ -262,32 +240,11 @@ def evaluate_depth(
 def _show(rows: list[dict[str, Any]], output: Path | None, as_json: bool) -> None:
     """Write the rows, if a file is named, and print them."""
     from erfsfm.common.files import write_atomically
+    from erfsfm.evaluation.depth_protocols import for_a_table
 
     if output is not None:
         write_atomically(output, json.dumps(rows, indent=2) + "\n")
-    print_rows(rows if as_json else _narrow(rows), as_json)
-
-
-def _narrow(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """What of streets' rows fits into a table of 80 columns; other rows as they are."""
-    if "refined_se" in rows[0]:
-        keys = ("street", "learned", "refined", "refined_se", "median", "in_90", "frames")
-        return [{key: row[key] for key in keys if key in row} for row in rows]
-    if "abs_rel_se" not in rows[0]:
-        return rows
-    compares = any("ratio" in row for row in rows)
-    shown = []
-    for row in rows:
-        head = {"street": row.get("street", "mean"), "weights": row["method"]}
-        errors = {"abs_rel": row["abs_rel"], "se": row["abs_rel_se"]}
-        if compares:
-            shown.append(
-                head | errors | {"ratio": row.get("ratio"), "ratio se": row.get("ratio_se")}
-            )
-        else:
-            errors |= {key: row[key] for key in ("rmse", "a1", "images", "leak")}
-            shown.append({"method": row.get("street", row["method"])} | errors)
-    return shown
+    print_rows(rows if as_json else for_a_table(rows), as_json)
 
 
 @evaluate_app.command("pose")

@@ -69,13 +69,11 @@ def scale_intrinsics(
     """
     scaled = K.clone()
     if fidelity == "paper":
-        scaled[:, :2] = K[:, :2] * (size[0] / full[0])
+        scaled[:, :2] *= size[0] / full[0]
         return scaled
-    sy, sx = size[0] / full[0], size[1] / full[1]
-    scaled[:, 0] = K[:, 0] * sx
-    scaled[:, 1] = K[:, 1] * sy
-    scaled[:, 0, 2] = (K[:, 0, 2] + 0.5) * sx - 0.5
-    scaled[:, 1, 2] = (K[:, 1, 2] + 0.5) * sy - 0.5
+    for row, ratio in enumerate((size[1] / full[1], size[0] / full[0])):
+        scaled[:, row] *= ratio
+        scaled[:, row, 2] += 0.5 * ratio - 0.5
     return scaled
 
 
@@ -102,12 +100,7 @@ def backproject(depth: Tensor, K: Tensor) -> Tensor:
         Points in the camera frame, in the depth's unit, ``(B, 3, H * W)``.
     """
     batch, _, height, width = depth.shape
-    K_inverse = torch.zeros_like(K)  # in closed form: there is no skew
-    K_inverse[:, 0, 0] = 1 / K[:, 0, 0]
-    K_inverse[:, 1, 1] = 1 / K[:, 1, 1]
-    K_inverse[:, 0, 2] = -K[:, 0, 2] / K[:, 0, 0]
-    K_inverse[:, 1, 2] = -K[:, 1, 2] / K[:, 1, 1]
-    K_inverse[:, 2, 2] = 1
+    K_inverse, _ = torch.linalg.inv_ex(K)  # a check would wait for a GPU
     rays = K_inverse @ pixel_grid(height, width, depth)  # (B, 3, H*W)
     return rays * depth.reshape(batch, 1, height * width)
 

@@ -93,22 +93,14 @@ def photometric_error(target: Tensor, warped: Tensor, ssim_weight: float) -> Ten
     return ssim_weight * structural + (1 - ssim_weight) * absolute
 
 
-def _dx(x: Tensor) -> Tensor:
-    return x[..., :, 1:] - x[..., :, :-1]
-
-
-def _dy(x: Tensor) -> Tensor:
-    return x[..., 1:, :] - x[..., :-1, :]
-
-
 def second_order_smoothness(values: Tensor) -> Tensor:
     """Mean absolute second differences, not edge-aware: the paper's smoothness term.
 
     Args:
         values: depth or disparity, ``(B, 1, H, W)``.
     """
-    dx, dy = _dx(values), _dy(values)
-    second = (_dx(dx), _dy(dx), _dx(dy), _dy(dy))
+    dx, dy = values.diff(), values.diff(dim=-2)
+    second = (dx.diff(), dx.diff(dim=-2), dy.diff(), dy.diff(dim=-2))
     return torch.stack([d.abs().mean() for d in second]).sum()
 
 
@@ -122,9 +114,11 @@ def edge_aware_smoothness(values: Tensor, image: Tensor) -> Tensor:
         image: ``(B, 3, H, W)`` in [0, 1].
     """
     normalised = values / (values.mean(dim=(2, 3), keepdim=True) + 1e-7)
-    weight_x = torch.exp(-_dx(image).abs().mean(dim=1, keepdim=True))
-    weight_y = torch.exp(-_dy(image).abs().mean(dim=1, keepdim=True))
-    return (_dx(normalised).abs() * weight_x).mean() + (_dy(normalised).abs() * weight_y).mean()
+    terms = []
+    for axis in (-1, -2):
+        weight = torch.exp(-image.diff(dim=axis).abs().mean(dim=1, keepdim=True))
+        terms.append((normalised.diff(dim=axis).abs() * weight).mean())
+    return torch.stack(terms).sum()
 
 
 def enlarged(disparity: Tensor, level: int, size: tuple[int, int]) -> Tensor:

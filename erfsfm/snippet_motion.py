@@ -137,13 +137,9 @@ def _fitted(
     for outlier in _OUTLIERS:
         M = _halfway(R)
         t, turned = (M @ direction)[..., None], R @ rays
-        slope = (
-            t[:, [1, 2]] * turned[:, [2, 0]] - t[:, [2, 0]] * turned[:, [1, 2]]
-        )  # of the epipolar line
+        slope = np.cross(t, turned, axis=1)[:, :2]  # of the epipolar line
         width = np.maximum(np.sqrt(((slope / f[:, None]) ** 2).sum(axis=1, keepdims=True)), 1e-12)
-        normal = (
-            turned[:, [1, 2, 0]] * seen[:, [2, 0, 1]] - turned[:, [2, 0, 1]] * seen[:, [1, 2, 0]]
-        )
+        normal = np.cross(turned, seen, axis=1)
         by_turn = seen * (turned * t).sum(axis=1, keepdims=True) - t * (turned * seen).sum(
             axis=1, keepdims=True
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -103,14 +104,12 @@ def _scale_crop(
     left = int(rng.integers(size[0] - width + 1))
     top = int(rng.integers(size[1] - height + 1))
     part = slice(top, top + height), slice(left, left + width)
-    crops = []
-    for image in images:
-        larger = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
-        crops.append(np.ascontiguousarray(larger[part]))
-    moved = []
-    for values in maps:
-        larger = cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT)
-        moved.append(np.ascontiguousarray(larger[part]))
+
+    def crop(values: Any, how: int) -> Any:
+        return np.ascontiguousarray(cv2.resize(values, size, interpolation=how)[part])
+
+    crops = [crop(image, cv2.INTER_LINEAR) for image in images]
+    moved = [crop(values, cv2.INTER_NEAREST_EXACT) for values in maps]
     return crops, moved, enlarged.cropped(left, top, width, height)
 
 

@@ -236,6 +236,28 @@ def _depth_row(
     return row | {"images": len(scales), "streets": len(streets)}
 
 
+def for_a_table(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What of streets' rows fits into a table of 80 columns; other rows as they are."""
+    if "refined_se" in rows[0]:
+        keys = ("street", "learned", "refined", "refined_se", "median", "in_90", "frames")
+        return [{key: row[key] for key in keys if key in row} for row in rows]
+    if "abs_rel_se" not in rows[0]:
+        return rows
+    compares = any("ratio" in row for row in rows)
+    shown = []
+    for row in rows:
+        head = {"street": row.get("street", "mean"), "weights": row["method"]}
+        errors = {"abs_rel": row["abs_rel"], "se": row["abs_rel_se"]}
+        if compares:
+            shown.append(
+                head | errors | {"ratio": row.get("ratio"), "ratio se": row.get("ratio_se")}
+            )
+        else:
+            errors |= {key: row[key] for key in ("rmse", "a1", "images", "leak")}
+            shown.append({"method": row.get("street", row["method"])} | errors)
+    return shown
+
+
 def many_view_protocol(
     networks: DepthPosePredictor,
     recordings: Sequence[Recording],

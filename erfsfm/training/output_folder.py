@@ -281,6 +281,26 @@ def licence_of(seen: list[str]) -> str:
     return "unknown: depends on the training data"
 
 
+def how_good(folder: Path) -> str:
+    """What the last validation measured, and the command that measures the weights on other data."""
+    record = read_record(folder / "model.yaml")
+    units = {
+        "abs_rel": "AbsRel {:.3f}",
+        "snippet_ate": "snippet ATE {:.4f} m",
+        "photometric": "photometric error {:.4f}",
+    }
+    measured = [
+        text.format(record.metrics[key])
+        for key, text in units.items()
+        if math.isfinite(record.metrics.get(key, math.nan))
+    ]
+    kind, data = ("pose", "KITTI --sequence 09") if record.networks == "pose" else ("depth", "ROOT")
+    said = f"validation: {', '.join(measured)}" if measured else "they were not validated"
+    return (
+        f"{said}; errors on other data: erfsfm evaluate {kind} --weights {folder} --dataset {data}"
+    )
+
+
 class StepProgress(Callback):
     """Tells of all steps, also after a resume, and of the loss of the latest; logs what a step takes."""
 

@@ -67,6 +67,7 @@ from slam.runtime.files import (
 )
 from slam.runtime.imports import import_extra
 from slam.sequences.camera_file import AUTO, write_camera
+from slam.sequences.catalogue import open_sequence
 from slam.sequences.gps_track import read_gps
 from slam.sequences.recording import RecordedSequence
 from slam.simulation.recording import open_or_embedded
@@ -368,7 +369,8 @@ def open_recording(request: RunRequest) -> RecordedSequence:
     try:
         recording = open_or_embedded(*place, asked, request.frames, request.truth)
     except MissingCameraError:
-        return open_recording(request.model_copy(update={"camera": AUTO}))
+        asked = AUTO
+        recording = open_sequence(*place, asked, request.frames, request.truth)
     camera = recording.camera
     if asked is None or not is_auto(asked) or not isinstance(camera, CameraFile):
         return recording

@@ -93,14 +93,14 @@ class SurfaceTruth:
 
     ``name`` says what it is, ``frames`` ``(F,)`` which frames measured the surface, ``view`` gives the surface as one
     of them measured it. ``in_field`` says whether the sensor could have measured points ``(P, 3)`` from any of some
-    frames that were viewed, if nothing hid them. ``distance``, where the surface is known exactly, gives the distances
-    ``(P,)`` of points ``(P, 3)`` to it.
+    frames that were viewed, if nothing hid them; by default it could. ``distance``, where the surface is known exactly,
+    gives the distances ``(P,)`` of points ``(P, 3)`` to it.
     """
 
     name: str
     frames: Indices
     view: Callable[[int], Surface]
-    in_field: Callable[[FloatArray, Indices], Mask]
+    in_field: Callable[[FloatArray, Indices], Mask] = lambda points, _: np.ones(len(points), bool)
     distance: Callable[[FloatArray], FloatArray] | None = None
 
 
@@ -149,18 +149,18 @@ def accumulated(truth: SurfaceTruth, views: Indices, positions: FloatArray) -> S
     """
     margin = RANGE_M + _BEYOND_M
     low, high = positions.min(axis=0) - margin, positions.max(axis=0) + margin
-    surface = Surface(np.empty((0, 3)), np.empty(0, dtype=bool))
-    waiting: list[Surface] = []
+    surfaces = [Surface(np.empty((0, 3)), np.empty(0, dtype=bool))]  # the first is thinned
     for number, frame in enumerate(views, 1):
         view = truth.view(int(frame))
         inside = ((view.points >= low) & (view.points <= high)).all(axis=1)
-        waiting.append(Surface(view.points[inside], view.in_image[inside]))
-        if number == len(views) or sum(len(each.points) for each in waiting) > _WAITING_POINTS:
-            points = np.concatenate([surface.points, *(each.points for each in waiting)])
-            in_image = np.concatenate([surface.in_image, *(each.in_image for each in waiting)])
+        surfaces.append(Surface(view.points[inside], view.in_image[inside]))
+        waiting = sum(len(each.points) for each in surfaces[1:])
+        if number == len(views) or waiting > _WAITING_POINTS:
+            points = np.concatenate([each.points for each in surfaces])
+            in_image = np.concatenate([each.in_image for each in surfaces])
             chosen = thinned(points, TRUTH_VOXEL_M, np.argsort(~in_image, kind="stable"))
-            surface, waiting = Surface(points[chosen], in_image[chosen]), []
-    return surface
+            surfaces = [Surface(points[chosen], in_image[chosen])]
+    return surfaces[0]
 
 
 def backprojected(
@@ -303,9 +303,9 @@ def placed_errors(distances: MapDistances) -> dict[str, Any]:
         of_surface = (distances.surface_range >= from_m) & (distances.surface_range < to_m)
         ring = _errors(own[of_map], true[of_surface], _LEAST_IN_BIN)
         counts = {"map_points": int(of_map.sum()), "surface_points": int(of_surface.sum())}
-        curve.append(SurfaceMetrics.of(from_m=from_m, to_m=to_m, **ring, **counts))
+        curve.append({"from_m": from_m, "to_m": to_m} | ring | counts)
     share = _share(in_field) if len(in_field) else _NO_MAP
-    fair = SurfaceMetrics.of(**_errors(own[in_field], true[near], 1), share=share)
+    fair = _errors(own[in_field], true[near], 1) | {"share": share}
     return _errors(own, true[near], 1) | {"in_field": fair, "by_distance": curve}
 
 
@@ -313,31 +313,27 @@ def _errors(own: FloatArray, true: FloatArray, least: int) -> dict[str, Any]:
     """Accuracy, completeness and F-scores of distances from the map and to it, missing below ``least`` points."""
     no_map = (_NO_MAP if least == 1 else _FEW) if len(own) < least else None
     no_surface = (_NO_SURFACE if least == 1 else _FEW) if len(true) < least else None
-    precision = {key: no_map or _share(own <= within) for key, within in F_SCORES_M.items()}
-    recall = {key: no_surface or _share(true <= within) for key, within in F_SCORES_M.items()}
+    precision: dict[str, Any] = {}
+    recall: dict[str, Any] = {}
+    f_score: dict[str, Any] = {}
+    for key, within in F_SCORES_M.items():
+        p: Any = no_map or _share(own <= within)
+        r: Any = no_surface or _share(true <= within)
+        precision[key], recall[key] = p, r
+        f_score[key] = no_map or no_surface or 2 * p * r / (p + r or 1.0)
     return {
         "accuracy_median_m": no_map or median(own),
         "accuracy_90_m": no_map or float(np.quantile(own, 0.9)),
         "outlier_share": no_map or _share(own > OUTLIER_M),
         "completeness": no_surface or _share(true <= COVERED_WITHIN_M),
-        "f_score": Within.of(
-            **{key: _harmonic_mean(precision[key], recall[key]) for key in F_SCORES_M}
-        ),
-        "precision": Within.of(**precision),
-        "recall": Within.of(**recall),
+        "f_score": f_score,
+        "precision": precision,
+        "recall": recall,
     }
 
 
 def _share(which: Mask) -> float:
     return float(which.mean())
-
-
-def _harmonic_mean(precision: float | Failed, recall: float | Failed) -> float | Failed:
-    if isinstance(precision, Failed):
-        return precision
-    if isinstance(recall, Failed):
-        return recall
-    return 2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0
 
 
 def _sampled(points: FloatArray, candidates: Indices) -> Indices:

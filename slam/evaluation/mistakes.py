@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.formats.trajectory import Trajectory
 from slam.geometry import se3
-from slam.geometry.robust import median
+from slam.geometry.robust import median, rms
 from slam.geometry.se3 import FloatArray, interpolated, length_of
 
 _BETTER = 3.0  # times; what fits by chance is nearer
@@ -117,7 +117,7 @@ def _said(words: str, before: float, after: float, unit: str = "m") -> str:
 def _ate(estimate: FloatArray, reference: FloatArray) -> float:
     """Error of positions ``(N, 3)`` at 7 dof, in the reference's unit."""
     fit = se3.umeyama(reference, estimate, with_scale=True)
-    return float(np.sqrt(((fit.apply(estimate) - reference) ** 2).sum(axis=1).mean()))
+    return rms(np.linalg.norm(fit.apply(estimate) - reference, axis=1))
 
 
 def _clock(estimate: Trajectory, reference: Trajectory) -> tuple[float, float, float]:
@@ -155,7 +155,7 @@ def _rotations(T_estimate: FloatArray, T_reference: FloatArray) -> list[str]:
     """What makes the motions of the camera between rows turn as those of the reference."""
 
     def error(turns: FloatArray) -> float:
-        return float(np.sqrt(((turns - truth) ** 2).sum(axis=1).mean()))
+        return rms(np.linalg.norm(turns - truth, axis=1))
 
     truth, turns = _turns(T_reference), _turns(T_estimate)
     fits = [(error(_turns(change(T_estimate))), words) for words, change in _OF_ROTATIONS]

@@ -215,7 +215,12 @@ def complete_drive(
         filled.trusted,
         filled.interpolated,
         filled.gap_steps,
-        find_segments(len(measured), cuts, filled.interpolated, map_poses.relates),
+        find_segments(
+            len(measured),
+            cuts,
+            filled.interpolated,
+            lambda first: map_poses.across(first) is not None,
+        ),
         map_poses,
         sorted([*measured.events, *joins], key=lambda event: event.frame),
     )

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import reduce
-from itertools import pairwise
 
 import numpy as np
 
-from slam.frames import KEYFRAME_SOURCE, RelativePose, runs
+from slam.frames import KEYFRAME_SOURCE, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.gaps import INTERPOLATED_SOURCE
-from slam.frontend.keyframes.relative_poses import KeyframePoses, chained
+from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.lidar_odometry import LIDAR_SOURCE
 from slam.frontend.network_motion import (
     NETWORK_SOURCE,
@@ -24,7 +22,7 @@ from slam.frontend.network_motion import (
 )
 from slam.frontend.scale import Scale
 from slam.frontend.visual.noise import step_noise
-from slam.geometry.se3 import FloatArray, compose, equal_step, invert, length_of, rigid
+from slam.geometry.se3 import FloatArray, compose, rigid
 
 logger = logging.getLogger(__name__)
 
@@ -58,9 +56,6 @@ def make_factors(drive: Drive, scale: Scale, level: int = logging.INFO) -> list[
     by_network = _outside(maps, networks)
     by_image = _outside(maps, geometric)
     interpolated = _outside(maps, [scale.scaled(pose) for pose in drive.gap_steps])
-    interpolated = join_gap_ends(
-        interpolated, [*by_network, *by_image], by_keyframes, maps.segments
-    )
     return [*by_network, *interpolated, *by_image, *by_keyframes]
 
 
@@ -77,13 +72,8 @@ def chain_odometry(factors: Sequence[RelativePose], count: int) -> FloatArray:
             first. Of several that are equally good and long, the last one is taken.
         count: frames.
     """
-    arriving: dict[int, RelativePose] = {}
-    for factor in factors:
-        first, last = factor.ends
-        if first < last and (
-            last not in arriving or _precedence(factor) >= _precedence(arriving[last])
-        ):
-            arriving[last] = factor
+    by_precedence = sorted(factors, key=_precedence)
+    arriving = {each.to_index: each for each in by_precedence if each.from_index < each.to_index}
     T_world_camera = np.tile(np.eye(4), (count, 1, 1))
     T_from_to = rigid(np.array([arriving[k].T_from_to for k in range(1, count)]).reshape(-1, 4, 4))
     for k, T_first_camera in enumerate(T_from_to, start=1):
@@ -100,48 +90,3 @@ def _precedence(factor: RelativePose) -> tuple[bool, bool, int, bool, bool]:
     by_map, by_network = source == KEYFRAME_SOURCE, source == NETWORK_SOURCE
     is_guess, by_lidar = source == INTERPOLATED_SOURCE, source == LIDAR_SOURCE
     return by_map, not by_network, factor.from_index, not is_guess, not by_lidar
-
-
-def join_gap_ends(
-    interpolated: Sequence[RelativePose],
-    measured: Sequence[RelativePose],
-    by_map: Sequence[RelativePose],
-    maps: Mapping[int, int],
-) -> list[RelativePose]:
-    """The interpolated steps. Equal steps across a gap replace the steps in the gap if one map has both sides.
-
-    Constant velocity is a poor guess over a long gap, and many such steps would outvote the one
-    pose by the map.
-
-    Args:
-        interpolated: steps without a measurement, in one unit with all others.
-        measured: steps between other frames.
-        by_map: relative poses within maps.
-        maps: the map of each frame that has a pose in one.
-    """
-    T_map_camera = chained(by_map)
-    loose = {pose.from_index: pose for pose in interpolated}
-    T_step = {}
-    for pose in measured:
-        if pose.to_index == pose.from_index + 1:
-            T_step[pose.from_index] = pose.T_from_to
-    for pose in interpolated:
-        T_step[pose.from_index] = pose.T_from_to
-    for first, last in pairwise(sorted(maps)):
-        steps = range(first, last)
-        if (
-            maps[first] != maps[last]
-            or loose.keys().isdisjoint(steps)
-            or not T_step.keys() >= set(steps)
-        ):
-            continue
-        begin, end = max(runs(loose.keys() & set(steps)), key=lambda run: run[1] - run[0])
-        T_first_begin = reduce(np.matmul, (T_step[k] for k in range(first, begin)), np.eye(4))
-        T_end_last = reduce(np.matmul, (T_step[k] for k in range(end + 1, last)), np.eye(4))
-        T_first_last = invert(T_map_camera[first]) @ T_map_camera[last]
-        T = equal_step(invert(T_first_begin) @ T_first_last @ invert(T_end_last), end + 1 - begin)
-        length = length_of(T[:3, 3])
-        for k in range(begin, end + 1):
-            sigmas = np.maximum(loose[k].sigmas, [0.0, 0.0, 0.0, length, length, length])
-            loose[k] = replace(loose[k], T_from_to=T, sigmas=sigmas)
-    return list(loose.values())

@@ -96,7 +96,7 @@ def interpolate_gaps(
         _filled(measured.snippets, _completed(raw, range(count - 1)), count, sources),
         trusted,
         dict(sorted(frames.items())),
-        [_guess(k, motion[k], typical) for k in loose],
+        [_guess(k, motion[k], max(typical, map_poses.across(k + 1) or 0.0)) for k in loose],
     )
 
 
@@ -106,9 +106,13 @@ def _is_trusted(snippet: SnippetPoses, frozen: Collection[int], cuts: Collection
     return span.isdisjoint(frozen) and set(cuts).isdisjoint(range(min(span) + 1, max(span) + 1))
 
 
-def _guess(k: int, T_k_next: FloatArray, typical: float) -> RelativePose:
-    """An interpolated step, whose sigmas are wide: by its length, or by a ``typical`` one."""
-    length = max(length_of(T_k_next[:3, 3]), typical, _SIGMA_FLOOR)
+def _guess(k: int, T_k_next: FloatArray, usual: float) -> RelativePose:
+    """An interpolated step, whose sigmas are wide: by its length, or by a ``usual`` one.
+
+    Where one map has both sides of a gap, that is all the way between them: by constant velocity many such steps would
+    outvote the one pose by the map.
+    """
+    length = max(length_of(T_k_next[:3, 3]), usual, _SIGMA_FLOOR)
     sigmas = np.repeat([np.deg2rad(_ROTATION_SIGMA_DEG), _TRANSLATION_RELATIVE_SIGMA * length], 3)
     return RelativePose(k, k + 1, T_k_next, sigmas, INTERPOLATED_SOURCE)
 

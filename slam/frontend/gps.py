@@ -223,11 +223,11 @@ class LocalFrame:
 
     def __init__(self, place: FloatArray) -> None:
         """At a place ``(3,)``: latitude and longitude in degrees, height in metres."""
-        latitude, longitude = place[:2]
+        (latitude, longitude, _), origin = place, _earth_centred(place[None])[0]
         # about the axis of the earth until x is east, then about that until z is up
         turns = [90.0 + longitude, 90.0 - latitude]
         R_earth_local = Rotation.from_euler("ZX", turns, degrees=True).as_matrix()
-        self._T_earth_local = se3.make(R_earth_local, _earth_centred(place[None])[0])
+        self._T_earth_local = se3.make(R_earth_local, origin)
 
     def points(self, places: FloatArray) -> FloatArray:
         """Points ``(N, 3)`` east, north, up of places ``(N, 3)``."""

@@ -8,7 +8,7 @@ A motion between two views of calibrated points is ``x_current ~ R_current_previ
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -157,25 +157,20 @@ def _best(
     spread: FloatArray | None,
     votes: BoolArray,
 ) -> Resection:
-    """The pose by the points that vote ``(M,)``."""
+    """The pose by the points that vote ``(M,)``: the first one that most of them fit, or that which most fit."""
 
-    def is_sure(pose: Resection) -> bool:
-        return bool(_support(pose, votes) >= _DOUBTFUL_RATIO * votes.sum())
-
-    def better(pose: Resection | None, T_camera_world: FloatArray) -> Resection:
-        other = _refined(T_camera_world, points, spread, pixels, K, votes)
-        return max(pose or other, other, key=lambda pose: _support(pose, votes))
-
-    best = better(None, guesses[0])
-    for guess in guesses[1:]:
-        if is_sure(best):
-            break
-        best = better(best, guess)
-    if not is_sure(best):
+    def starts() -> Iterator[FloatArray]:
+        yield from guesses
         start, inliers = consensus(points[votes], pixels[votes], K, _SAMPLES, INLIER_PX, seed)
         if len(inliers):
-            best = better(best, start)
-    return best
+            yield start
+
+    found: list[Resection] = []
+    for start in starts():
+        found.append(_refined(start, points, spread, pixels, K, votes))
+        if _support(found[-1], votes) >= _DOUBTFUL_RATIO * votes.sum():
+            return found[-1]
+    return max(found, key=lambda pose: _support(pose, votes))
 
 
 def _refined(

@@ -69,31 +69,20 @@ class LoopClosures:
     def details(self) -> dict[str, Any]:
         """For ``loops.json``: every accepted loop with its measurement, and the rejected ones with most inliers."""
 
-        def entry(ends: tuple[int, int], loop: Loop | RejectedLoop, **more: Any) -> dict[str, Any]:
-            return {
-                "from": ends[0],
-                "to": ends[1],
-                "inliers": loop.inliers,
-                "score": round(loop.score, 4),
-                **more,
-            }
+        def entry(loop: Loop | RejectedLoop, reason: str) -> dict[str, Any]:
+            first, last = loop.ends
+            found = {"inliers": loop.inliers, "score": round(loop.score, 4), "reason": reason}
+            return {"from": first, "to": last} | found
 
         accepted = []
         for loop in self.accepted:
-            reason = f"{loop.inliers} inliers in both directions"
-            T_from_to, sigmas = loop.measured.T_from_to.tolist(), loop.measured.sigmas.tolist()
-            accepted.append(
-                entry(loop.ends, loop, reason=reason, T_from_to=T_from_to, sigmas=sigmas)
-            )
-        rejected = [
-            entry((loop.from_index, loop.to_index), loop, reason=loop.reason)
-            for loop in self.rejected
-        ]
-        more = max(len(rejected) - MOST_REJECTED, 0)
+            pose = loop.measured
+            measured = {"T_from_to": pose.T_from_to.tolist(), "sigmas": pose.sigmas.tolist()}
+            accepted.append(entry(loop, f"{loop.inliers} inliers in both directions") | measured)
         return {
             "accepted": accepted,
-            "rejected": rejected[:MOST_REJECTED],
-            "rejected_left_out": more,
+            "rejected": [entry(loop, loop.reason) for loop in self.rejected[:MOST_REJECTED]],
+            "rejected_left_out": max(len(self.rejected) - MOST_REJECTED, 0),
         }
 
 
@@ -165,9 +154,7 @@ def find_loops(
 
 def most_inliers_first(loops: Iterable[RejectedLoop]) -> tuple[RejectedLoop, ...]:
     """Rejected loops in the order in which they are reported."""
-    return tuple(
-        sorted(loops, key=lambda loop: (-loop.inliers, -loop.score, loop.to_index, loop.from_index))
-    )
+    return tuple(sorted(loops, key=lambda loop: (-loop.inliers, -loop.score, loop.ends[::-1])))
 
 
 def _frames(views: Sequence[View]) -> NDArray[np.intp]:

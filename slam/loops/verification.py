@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose, View
+from slam.frames import LOOP_SOURCE, Ends, Intrinsics, RelativePose, View
 from slam.geometry.multiview import consensus, resect
 from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray, apply, invert, length_of, make, rotation_angle
@@ -92,21 +92,20 @@ class Loop:
     pixels: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2, 2), np.float32))
 
     @property
-    def ends(self) -> tuple[int, int]:
+    def ends(self) -> Ends:
         """Earlier and later frame."""
-        return self.measured.from_index, self.measured.to_index
+        return self.measured.ends
 
     def refused(self, reason: str) -> RejectedLoop:
         """The same loop, rejected for a reason."""
-        return RejectedLoop(*self.ends, reason, self.score, self.inliers)
+        return RejectedLoop(self.ends, reason, self.score, self.inliers)
 
 
 @dataclass(frozen=True)
 class RejectedLoop:
-    """A rejected candidate or loop."""
+    """A rejected candidate or loop between an earlier and a later frame."""
 
-    from_index: int
-    to_index: int
+    ends: Ends
     reason: str
     score: float
     inliers: int = 0
@@ -143,7 +142,7 @@ class LoopVerifier:
         rows_earlier, rows_later = matches(earlier, later, self.thresholds)
 
         def refused(reason: str, inliers: int = 0) -> RejectedLoop:
-            return RejectedLoop(earlier.index, later.index, reason, score, inliers)
+            return RejectedLoop((earlier.index, later.index), reason, score, inliers)
 
         if len(rows_earlier) < self.thresholds.min_inliers:
             return refused(f"only {len(rows_earlier)} matches")

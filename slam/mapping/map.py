@@ -77,7 +77,7 @@ class TsdfMap:
             )
         if self._surface is None:
             self._finish_submap()
-            self._surface = MapSurface(self._finished, self._config, progress)
+            self._surface = MapSurface(self._finished, self._config, self._intrinsics, progress)
         return self._surface
 
     def cloud(self) -> Ply:
@@ -128,6 +128,6 @@ class TsdfMap:
         """Spill the submap that grows, if there is one."""
         if self._growing is None or not self._growing.blocks:
             return
-        fields = self._growing.observed() | self._views.take(self._intrinsics)
+        fields = self._growing.observed() | self._views.take()
         self._finished.append({name: self._spill.put(values) for name, values in fields.items()})
         self._growing = None

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 from scipy.spatial import cKDTree
 
+from slam.config.sections import MappingConfig
 from slam.frames import DepthMap, Image, Intrinsics
 from slam.geometry.robust import difference_equations, median
 from slam.geometry.se3 import FloatArray, apply, invert, length_of, rotation_angle
@@ -58,7 +59,6 @@ class Submap:
     ``tsdf`` ``(B, 4096)`` float16 in truncation distances, and ``weight`` ``(B, 4096)`` uint16, 0 where nothing was
     observed. Of each view: ``T_world_camera`` ``(K, 4, 4)``, image ``(K, h, w, 3)``, fused depth ``(K, h, w)`` float16,
     0 where nothing was fused, and ``brightness_steps`` ``(K, 3)`` by `_brightness_step`.
-    ``camera`` is fx, fy, cx, cy.
     """
 
     keys: NDArray[np.int32]
@@ -68,7 +68,6 @@ class Submap:
     images: NDArray[np.uint8]
     depths: NDArray[np.float16]
     brightness_steps: FloatArray
-    camera: FloatArray
 
 
 def new_grid(voxel_size_m: float, capacity: int = _CAPACITY) -> Any:
@@ -165,25 +164,18 @@ class MergedSubmaps:
         Coordinates ``(B, 3)``, distances ``(B, 4096)`` in truncation distances, and weights ``(B, 4096)``.
         """
         inside = [np.asarray(((keys >= low) & (keys < high)).all(axis=1)) for keys in self._keys]
-        keys = np.unique(
-            np.concatenate([own[mask] for own, mask in zip(self._keys, inside)]), axis=0
-        )
+        parts = [own[mask] for own, mask in zip(self._keys, inside)]
+        keys, rows = np.unique(np.concatenate(parts), axis=0, return_inverse=True)
         weight = np.zeros((len(keys), BLOCK_VOXELS), np.float32)
         total = np.zeros_like(weight)
-
-        def cells(of_blocks: Keys) -> NDArray[np.intp]:
-            return np.ravel_multi_index(tuple((of_blocks - low).T), tuple(high - low))
-
-        cells_of_all = cells(keys)
-        for number, mask in enumerate(inside):
-            if not mask.any():
+        ends = np.cumsum([len(part) for part in parts])
+        for number, own_rows in enumerate(np.split(rows.ravel(), ends[:-1])):
+            if not len(own_rows):
                 continue
-            submap = self.read(number)
-            # where each block of the submap is among all of them: the numbers of their cells are sorted as their keys
-            rows = np.searchsorted(cells_of_all, cells(self._keys[number][mask]))
+            submap, mask = self.read(number), inside[number]
             own = submap.weight[mask].astype(np.float32)
-            weight[rows] += own
-            total[rows] += own * submap.tsdf[mask]
+            weight[own_rows] += own
+            total[own_rows] += own * submap.tsdf[mask]
         np.divide(total, weight, out=total, where=weight > 0)
         return keys, total, weight
 
@@ -214,22 +206,16 @@ class ViewChooser:
         if self._best is None or sharpness > self._best[0]:
             self._best = sharpness, replace(view, depth=kept, relative_sigma=None)
 
-    def take(self, camera: Intrinsics) -> dict[str, NDArray[Any]]:
-        """The views since the last call, as fields of a `Submap`."""
+    def take(self) -> dict[str, NDArray[Any]]:
+        """The views since the last call, at least one, as fields of a `Submap`."""
         self._close()
         views, steps = self._chosen, self._steps
         self._chosen, self._steps = [], []
-        height, width = camera.height, camera.width
         return {
-            "T_world_camera": np.array([view.T_world_camera for view in views]).reshape(-1, 4, 4),
-            "images": np.array([view.image for view in views], dtype=np.uint8).reshape(
-                -1, height, width, 3
-            ),
-            "depths": np.array([view.depth for view in views], dtype=np.float16).reshape(
-                -1, height, width
-            ),
-            "brightness_steps": np.array(steps, dtype=np.float64).reshape(-1, 3),
-            "camera": np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
+            "T_world_camera": np.array([view.T_world_camera for view in views]),
+            "images": np.array([view.image for view in views]),
+            "depths": np.array([view.depth for view in views], dtype=np.float16),
+            "brightness_steps": np.array(steps),
         }
 
     def _close(self) -> None:
@@ -306,9 +292,9 @@ def _grey(image: Image) -> FloatArray:
 class Painter:
     """Colours points by the views of all submaps."""
 
-    def __init__(self, submaps: MergedSubmaps, voxel_size_m: float, reach_m: float) -> None:
-        """Even out the exposure of all views, and what their lens darkens."""
-        self._submaps, self._voxel, self._range = submaps, voxel_size_m, reach_m
+    def __init__(self, submaps: MergedSubmaps, config: MappingConfig, camera: Intrinsics) -> None:
+        """Even out the exposure of all views by one camera, and what its lens darkens."""
+        self._submaps, self._config, self._camera = submaps, config, camera
         steps, outwards, slopes = submaps.brightness_steps.T
         known = slopes[np.isfinite(slopes)]
         self._darkening = median(known) if len(known) else 0.0
@@ -320,7 +306,7 @@ class Painter:
         low, high = points_world.min(axis=0), points_world.max(axis=0)
         positions = self._submaps.T_world_views[:, :3, 3]
         away = np.linalg.norm(positions - np.clip(positions, low, high), axis=1)
-        for view in np.flatnonzero(away < self._range):
+        for view in np.flatnonzero(away < self._config.reach_m):
             self._add(int(view), points_world, total, weight)
         shown = weight > 0
         if not shown.any():
@@ -340,22 +326,17 @@ class Painter:
         own = view - int(np.searchsorted(self._submaps.submap_of_view, number))
         T_camera_world = invert(self._submaps.T_world_views[view])
         depth_of_points = points_world @ T_camera_world[2, :3] + T_camera_world[2, 3]
-        ahead = np.flatnonzero(depth_of_points > _NEAREST_VOXELS * self._voxel)
-        x, y, z = apply(T_camera_world, points_world[ahead]).T
-        fx, fy, cx, cy = submap.camera
+        voxel = self._config.voxel_size_m
+        ahead = np.flatnonzero(depth_of_points > _NEAREST_VOXELS * voxel)
+        points = apply(T_camera_world, points_world[ahead])
         depth, image = submap.depths[own], submap.images[own]
-        u, v = np.rint(fx * x / z + cx), np.rint(fy * y / z + cy)
+        u, v = np.rint(self._camera.project(points)).T
         inside = (u >= 0) & (u < depth.shape[1]) & (v >= 0) & (v < depth.shape[0])
-        u, v, z, ahead = (
-            u[inside].astype(np.intp),
-            v[inside].astype(np.intp),
-            z[inside],
-            ahead[inside],
-        )
+        u, v = u[inside].astype(np.intp), v[inside].astype(np.intp)
+        z, ahead = points[inside, 2], ahead[inside]
         known = depth[v, u]
-        same = (known > 0) & (
-            np.abs(known - z) < np.maximum(_SAME_VOXELS * self._voxel, _SAME_SURFACE * z)
-        )
+        nearly = np.maximum(_SAME_VOXELS * voxel, _SAME_SURFACE * z)
+        same = (known > 0) & (np.abs(known - z) < nearly)
         shown, share, u, v = ahead[same], z[same] ** -_NEARNESS, u[same], v[same]
         weight[shown] += share
         lens = np.exp(-self._darkening * _outwards(u, v, depth.shape))

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
-from erfsfm.common.progress import Progress, silent
+from erfsfm.common.progress import Progress
 from slam.config.sections import MappingConfig
 from slam.formats.ply import Ply, write_ply_pieces
-from slam.frames import Mask
+from slam.frames import Intrinsics, Mask
 from slam.geometry.se3 import FloatArray, IntArray, length_of
 from slam.mapping.submap import (
     BLOCK_SIDE,
@@ -68,7 +68,11 @@ class MapSurface:
     """The cleaned surface of finished submaps."""
 
     def __init__(
-        self, finished: Sequence[SpilledSubmap], config: MappingConfig, progress: Progress = silent
+        self,
+        finished: Sequence[SpilledSubmap],
+        config: MappingConfig,
+        camera: Intrinsics,
+        progress: Progress,
     ) -> None:
         """Merge the submaps and extract their surface.
 
@@ -82,7 +86,7 @@ class MapSurface:
         self._spill = SpillFile("the map")
         self._pieces: list[Piece] = []
         self.blocks, self.submaps = submaps.blocks, submaps.count
-        painter = Painter(submaps, config.voxel_size_m, config.reach_m)
+        painter = Painter(submaps, config, camera)
         tiles = submaps.tiles()
         for done, tile in enumerate(tiles, 1):
             patch = extract_tile(submaps, tile, config.voxel_size_m)
@@ -157,23 +161,19 @@ def _piece(patch: TileSurface, painter: Painter, spill: SpillFile) -> Piece:
     is_used[patch.triangles[patch.own]] = True
     used, renumbered = np.flatnonzero(is_used), np.cumsum(is_used) - 1
     triangles = renumbered[patch.triangles[patch.own]].astype(np.int32)
-    is_outside = np.zeros(len(patch.vertices), dtype=bool)
-    is_outside[patch.triangles[~patch.own]] = True
-    filled = np.zeros(len(patch.vertices), dtype=bool)
-    filled[patch.triangles[patch.filled, 2]] = True  # the vertex in the middle of a hole comes last
     vertices = np.empty(len(used), _FILLED)
     columns = np.hstack([patch.vertices, patch.normals()])[used]
     for name, column in zip(_LENGTHS, columns.T, strict=True):
         vertices[name] = column
     for name, shade in zip(_COLOURS, painter.colours(patch.vertices[used]).T, strict=True):
         vertices[name] = shade
-    vertices["filled"] = filled[used]
+    vertices["filled"] = used >= patch.observed
     ends = np.concatenate([triangles[:, :2], triangles[:, 1:]])
     links = coo_array(
         (np.ones(len(ends), dtype=bool), (ends[:, 0], ends[:, 1])), shape=(len(used), len(used))
     )
     parts, label = connected_components(links, directed=False)
-    shared = np.flatnonzero(is_outside[used])
+    shared = np.flatnonzero(np.isin(used, patch.triangles[~patch.own]))
     put = spill.put
     return Piece(
         put(vertices),
@@ -216,12 +216,11 @@ def _numbered(
         numbers = np.full(len(own), -1)
         groups = group[place : place + len(piece.shared)]
         is_first = earliest[groups] == np.arange(place, place + len(groups))
-        other, firsts = piece.shared[~is_first], piece.shared[is_first]
-        own[other] = False
+        own[piece.shared[~is_first]] = False
         count = int(np.count_nonzero(own))
         numbers[own] = np.arange(written, written + count)
-        row_of_group[groups[is_first]] = numbers[firsts]
-        numbers[other] = row_of_group[groups[~is_first]]
+        row_of_group[groups[is_first]] = numbers[piece.shared[is_first]]
+        numbers[piece.shared] = row_of_group[groups]
         rows.append((spill.put(numbers), written))
         triangles += int(piece.sizes[kept_part[first:last]].sum())
         place, written = place + len(groups), written + count
@@ -230,12 +229,15 @@ def _numbered(
 
 @dataclass(frozen=True)
 class TileSurface:
-    """Vertices ``(V, 3)`` in the world, triangles ``(T, 3)``, which of them belong to the tile, which close a hole."""
+    """Vertices ``(V, 3)`` in the world, triangles ``(T, 3)``, and which of them belong to the tile.
+
+    Vertices from number ``observed`` on close holes.
+    """
 
     vertices: FloatArray
     triangles: Triangles
     own: Mask
-    filled: Mask
+    observed: int
 
     def normals(self) -> FloatArray:
         """Unit normals ``(V, 3)``: means of the triangles around each vertex, by their area."""
@@ -262,7 +264,7 @@ def extract_tile(submaps: MergedSubmaps, tile: IntArray, voxel_size_m: float) ->
     own = in_tile(vertices[triangles].mean(axis=1), tile, voxel_size_m)
     if not own.any():
         return None
-    return TileSurface(vertices, triangles, own, np.zeros(len(own), dtype=bool))
+    return TileSurface(vertices, triangles, own, len(vertices))
 
 
 def in_tile(points: FloatArray, tile: IntArray, voxel_size_m: float) -> Mask:
@@ -336,15 +338,11 @@ def with_holes_closed(
         triangles.append(np.stack([np.roll(ring, -1), ring, np.full(len(ring), count)], axis=1))
         own.append(np.repeat(in_tile(middle[None], tile, voxel_size_m), len(ring)))
         count += 1
-    filled = np.concatenate(
-        [np.full(len(each), number > 0) for number, each in enumerate(triangles)]
-    )
     return replace(
         patch,
         vertices=np.concatenate(vertices),
         triangles=np.concatenate(triangles),
         own=np.concatenate(own),
-        filled=filled,
     )
 
 
@@ -355,8 +353,7 @@ def _is_small_and_flat(corners: FloatArray, up_world: FloatArray, largest_m: flo
     """
     if 2 * float(np.linalg.norm(corners, axis=1).max()) > largest_m:
         return False
-    (x, y, z), (u, v, w) = corners.T, corners[[*range(1, len(corners)), 0]].T
-    area = 0.5 * np.array([y @ w - z @ v, z @ u - x @ w, x @ v - y @ u])
+    area = 0.5 * np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)
     size = length_of(area)
     if size == 0 or float(-area @ up_world) < _UPWARDS * size:
         return False
@@ -368,40 +365,21 @@ def _rings(triangles: Triangles, upwards: FloatArray) -> list[IntArray]:
 
     Those of at most 100 edges whose vertices look upwards in the mean; ``upwards`` ``(V,)`` are cosines.
     """
-    vertices = len(upwards)
-    begin, end = _open_edges(triangles, vertices)
-    simple = (np.bincount(begin, minlength=vertices) == 1) & (
-        np.bincount(end, minlength=vertices) == 1
-    )
-    link = coo_array((np.ones(len(begin), dtype=bool), (begin, end)), shape=(vertices, vertices))
-    _, label = connected_components(link, directed=False)
-    broken = np.zeros(vertices, dtype=bool)  # rings that touch themselves
-    touched = np.zeros(vertices, dtype=bool)
-    touched[begin] = touched[end] = True
-    broken[label[touched & ~simple]] = True
-    edges_of = np.bincount(label[begin], minlength=vertices)
-    upwards_of = np.bincount(label[begin], weights=upwards[begin], minlength=vertices)
-    broken |= (edges_of > _MOST_EDGES) | (upwards_of < _UPWARDS * edges_of)
-    following = np.full(vertices, -1, dtype=np.int64)
-    following[begin] = end
-    chosen = begin[~broken[label[begin]]]
-    _, first = np.unique(label[chosen], return_index=True)
-    rings = []
-    for start in chosen[np.sort(first)].tolist():
-        ring = [start]
-        while (vertex := int(following[ring[-1]])) != start:
-            ring.append(vertex)
-        rings.append(np.array(ring, dtype=np.int64))
-    return rings
-
-
-def _open_edges(triangles: Triangles, vertices: int) -> tuple[IntArray, IntArray]:
-    """Begins and ends of the edges of one triangle alone, in its direction."""
     begin, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
-    low, high = np.minimum(begin, end), np.maximum(begin, end)
-    codes = np.sort(2 * (low * vertices + high) + (begin > end))  # sorting numbers alone is fast
-    is_new = np.concatenate([[True], codes[1:] // 2 != codes[:-1] // 2, [True]])
-    codes = codes[is_new[1:] & is_new[:-1]]
-    low, high = np.divmod(codes // 2, vertices)
-    is_down = codes % 2 == 1
-    return np.where(is_down, high, low), np.where(is_down, low, high)
+    edges = csr_array((np.ones(len(begin), dtype=bool), (begin, end)), shape=(len(upwards),) * 2)
+    begin, end = (edges > edges.T).nonzero()
+    # rings that touch themselves are left out
+    is_simple = np.bincount(np.append(begin, end), minlength=len(upwards)) == 2
+    chosen = is_simple[begin] & is_simple[end]
+    following = dict(zip(begin[chosen].tolist(), end[chosen].tolist()))
+    rings = []
+    while following:
+        start, vertex = following.popitem()
+        ring = [start]
+        while vertex in following:
+            ring.append(vertex)
+            vertex = following.pop(vertex)
+        is_upwards = upwards[ring].mean() >= _UPWARDS
+        if vertex == start and is_upwards and len(ring) <= _MOST_EDGES:
+            rings.append(np.array(ring))
+    return rings

@@ -1,20 +1,14 @@
-"""What is known of a drive before its pose graph, the estimate that fits its measurements, and the map of an estimate.
-
-The map is of learned depth of the keyframes, refined if so configured, and fused.
-"""
+"""The estimate that fits the measurements of a drive, and the depth of its keyframes as the map takes it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
 
-from erfsfm.common.processes import CORES, read_ahead
-from erfsfm.common.progress import Progress
 from erfsfm.mvs.refine import Decide
-from slam.config.sections import MappingConfig, SlamConfig
+from slam.config.sections import MappingConfig
 from slam.formats.trajectory import Trajectory
 from slam.frames import Intrinsics, RelativePose, View
 from slam.frontend.agreement import Agreement
@@ -30,14 +24,10 @@ from slam.loops.closure import LoopClosures
 from slam.loops.places import Places
 from slam.mapping.depth import DepthRefiner, KeyframeDepth
 from slam.mapping.map import TsdfMap
-from slam.mapping.submap import moved_rows
 from slam.runtime.errors import Failed
 from slam.runtime.stopwatch import Stopwatch
 
-# relative sigma of learned depth in rooms, in the unit of the drive: 90 % of the errors are within 1.645 sigmas
-_ROOM_SIGMA = 0.32
 _SOME = 20
-_KEYFRAME_ROTATION_DEG = 8.0  # rotation after which a frame is fused, degrees
 _STREET_DEPTH_M = 15.0  # median depth of a street
 
 
@@ -74,38 +64,6 @@ class Estimate:
         """Every view with its points at the poses of the optimised trajectory, and the camera."""
         frames = np.array([view.index for view in self.views], dtype=np.intp)
         return Places(intrinsics, tuple(self.views), self.optimised.T_world_camera[frames])
-
-
-def fuse(
-    estimate: Estimate,
-    intrinsics: Intrinsics,
-    config: SlamConfig,
-    decide: Decide | None,
-    compare: Callable[[KeyframeDepth], None],
-    progress: Progress,
-) -> TsdfMap:
-    """Learned depth at the optimised poses, refined and fused into one surface.
-
-    ``decide`` is between learned and measured depth, None where it is not refined; ``compare`` is called with each
-    keyframe's depth.
-    """
-    drive, scales = estimate.drive, estimate.scale.per_frame
-    T_world_camera = estimate.optimised.T_world_camera
-    height, width = drive.keyframes[0].depth_unscaled.shape
-    intrinsics = intrinsics.resized(width, height)
-    guess_sigma = _ROOM_SIGMA if drive.by_keyframes and config.depth.is_learned else None
-    depth_at = keyframe_depths(drive, scales, T_world_camera, intrinsics, decide, guess_sigma)
-    mapping = config.mapping if estimate.scale.is_metric else fitted(config.mapping, drive, scales)
-    tsdf_map = TsdfMap(mapping, intrinsics)
-    T_keyframes = T_world_camera[[keyframe.index for keyframe in drive.keyframes]]
-    selected = moved_rows(T_keyframes, mapping.keyframe_distance_m, _KEYFRAME_ROTATION_DEG)
-    with closing(read_ahead(depth_at, selected, CORES)) as ahead:
-        for done, keyframe in enumerate(estimate.stopwatch.each("depth refinement", ahead), 1):
-            compare(keyframe)
-            with estimate.stopwatch.stage("map"):
-                tsdf_map.integrate(keyframe)
-            progress("map", done, len(selected))
-    return tsdf_map
 
 
 def fitted(mapping: MappingConfig, drive: Drive, scale_per_frame: FloatArray) -> MappingConfig:

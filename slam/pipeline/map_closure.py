@@ -186,8 +186,6 @@ def _joined(
 ) -> tuple[LocalMap, list[float]]:
     """One map by loops and, after these, links; the ratio of each loop's corners that are still one point."""
     chosen = np.flatnonzero(np.isin(rows.maps, members))
-    place = np.full(len(rows.keyframes), -1)
-    place[chosen] = np.arange(len(chosen))
     maps, T_map_camera = rows.maps[chosen], rows.T_map_camera[chosen]
     edges, shared = [], []
     # between neighbouring keyframes of one map, whose unit hardly changes
@@ -199,7 +197,8 @@ def _joined(
                 sigmas = np.repeat([_ROTATION_SIGMA, length], 3)
                 pose = RelativePose(first, last, T_step, sigmas, KEYFRAME_SOURCE)
                 edges.append((pose, 1.0, _SCALE_SIGMA))
-    for loop, (earlier, later) in zip(loops, place[rows.track.rows(loops)].tolist(), strict=True):
+    places = np.searchsorted(chosen, rows.track.rows(loops)).tolist()
+    for loop, (earlier, later) in zip(loops, places, strict=True):
         pose = replace(loop.measured, from_index=earlier, to_index=later)
         scale_sigma = _LOOP_SCALE_SIGMA if loop.inliers else _LINK_SCALE_SIGMA
         edges.append((pose, loop.scale, scale_sigma))

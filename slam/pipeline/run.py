@@ -11,7 +11,7 @@ from threading import Event
 
 import numpy as np
 
-from erfsfm.common.processes import read_ahead
+from erfsfm.common.processes import CORES, read_ahead
 from erfsfm.common.progress import Progress, silent
 from erfsfm.common.signals import calling_on_signals
 from erfsfm.mvs.fusion import DepthFusion
@@ -37,7 +37,8 @@ from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures, close_loops
 from slam.mapping.depth import KeyframeDepth
 from slam.mapping.map import TsdfMap
-from slam.pipeline.estimate import Estimate, fuse
+from slam.mapping.submap import moved_rows
+from slam.pipeline.estimate import Estimate, fitted, keyframe_depths
 from slam.pipeline.map_closure import MapClosure, close_maps
 from slam.pipeline.observer import Observer
 from slam.runtime.errors import Failed, SequenceError, SlamError, attempt
@@ -48,6 +49,9 @@ from slam.sequences.recording import RecordedSequence
 logger = logging.getLogger(__name__)
 # images by which the part that is fixed to the camera is learned before the first step, and the frames they are from
 _IMAGES_AHEAD, _LOOKED_AHEAD = 60, 450
+# relative sigma of learned depth in rooms, in the unit of the drive: 90 % of the errors are within 1.645 sigmas
+_ROOM_SIGMA = 0.32
+_KEYFRAME_ROTATION_DEG = 8.0  # rotation after which a frame is fused, degrees
 
 
 class Recorder:
@@ -163,7 +167,8 @@ class SlamPipeline:
         if self._config.lidar.factors and scale.is_metric:
             factors += lidar_steps
         T_odometry = chain_odometry(factors, len(drive))
-        recorder.trajectory("odometry", self._trajectory(T_odometry))
+        odometry = self._trajectory(T_odometry)
+        recorder.trajectory("odometry", odometry)
         views = [view.scaled(float(scale.per_frame[view.index])) for view in drive.views]
         loops = self._loops(maps, drive, scale, views, T_odometry)
         location = self._located(T_odometry, scale)
@@ -180,7 +185,7 @@ class SlamPipeline:
         )
         return Estimate(
             network=network,
-            odometry=self._trajectory(T_odometry),
+            odometry=odometry,
             optimised=self._trajectory(T_optimised),
             lidar=lidar,
             reference=reference,
@@ -198,11 +203,31 @@ class SlamPipeline:
         )
 
     def fuse(self, estimate: Estimate, recorder: Recorder) -> TsdfMap | None:
-        """The map, as `slam.pipeline.estimate.fuse`; None where mapping is switched off, or no frame has depth."""
-        if not self._config.mapping.enabled or not estimate.drive.keyframes:
+        """Learned depth at the optimised poses, refined and fused into one surface.
+
+        None where mapping is switched off, or no frame has depth.
+        """
+        config, drive, watch = self._config, estimate.drive, estimate.stopwatch
+        if not config.mapping.enabled or not drive.keyframes:
             return None
-        camera, progress = self.sequence.intrinsics, self._progress
-        return fuse(estimate, camera, self._config, self._decide, recorder.keyframe, progress)
+        scales, T_world_camera = estimate.scale.per_frame, estimate.optimised.T_world_camera
+        height, width = drive.keyframes[0].depth_unscaled.shape
+        camera = self.sequence.intrinsics.resized(width, height)
+        guess_sigma = _ROOM_SIGMA if drive.by_keyframes and config.depth.is_learned else None
+        depth_at = keyframe_depths(drive, scales, T_world_camera, camera, self._decide, guess_sigma)
+        mapping = config.mapping
+        if not estimate.scale.is_metric:
+            mapping = fitted(mapping, drive, scales)
+        tsdf_map = TsdfMap(mapping, camera)
+        T_keyframes = T_world_camera[[keyframe.index for keyframe in drive.keyframes]]
+        selected = moved_rows(T_keyframes, mapping.keyframe_distance_m, _KEYFRAME_ROTATION_DEG)
+        with closing(read_ahead(depth_at, selected, CORES)) as ahead:
+            for done, keyframe in enumerate(watch.each("depth refinement", ahead), 1):
+                recorder.keyframe(keyframe)
+                with watch.stage("map"):
+                    tsdf_map.integrate(keyframe)
+                self._progress("map", done, len(selected))
+        return tsdf_map
 
     def observer(self) -> Observer:
         """Measures the frames of the sequence, one pass."""

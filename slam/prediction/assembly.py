@@ -78,17 +78,17 @@ def open_depth(
     kind, _, argument = config.source.partition(":")
     if kind == "network":
         return None
+    if kind in ("npy", "png"):
+        if numbers is None:
+            raise SlamError(
+                f"depth.source={config.source} needs a whole sequence, with its depth on disk: choose network or "
+                "onnx:FILE for frames as they come"
+            )
+        return DepthFolder(config, numbers, intrinsics.width, intrinsics.height, undistort)
     if kind == "onnx":
         return OnnxDepth(config)
-    if kind in plug_ins(DEPTH_PLUG_INS):
-        opened: DepthSource = import_plug_in(plug_ins(DEPTH_PLUG_INS)[kind])(argument, intrinsics)
-        return opened
-    if numbers is None:
-        raise SlamError(
-            f"depth.source={config.source} needs a whole sequence, with its depth on disk: choose network or onnx:FILE "
-            "for frames as they come"
-        )
-    return DepthFolder(config, numbers, intrinsics.width, intrinsics.height, undistort)
+    opened: DepthSource = import_plug_in(plug_ins(DEPTH_PLUG_INS)[kind])(argument, intrinsics)
+    return opened
 
 
 def open_prediction(

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
-from scipy.special import chdtri, fdtri
+from scipy.special import fdtri
 
 from erfsfm.evaluation.pose_metrics import (
     SnippetErrors,
@@ -37,12 +37,14 @@ from slam.runtime.stopwatch import Stopwatch
 
 LEVELS = (50, 90, 95)  # per cent of the factors that the bounds of their stated noise hold
 _NO_TRUTH = Failed("the sequence has no true poses")
+_NORMAL_DOF = 1e12  # whose F is a chi-square over its degrees of freedom, to 1e-11
 _TOP_SPEED_S = 1.0  # steps alone are noisy
 _NO_HEIGHTS = Failed("the GPS track has no altitudes")
 _BY_MAPS = Failed("maps of keyframes give the poses, not steps from frame to frame")
 _NOTHING_FIXED = Failed(
     "nothing was found that is fixed to the camera, or too few images moved to find it"
 )
+_STANDS_STILL = Failed("the estimate does not move: the truth cannot be scaled to it")
 _NO_MAP_YET = Failed("the run ended before its map was whole")
 
 
@@ -62,7 +64,7 @@ def estimate_metrics(
         motion=_motion(result),
         timing=timing_of(result.stopwatch, len(sequence)),
         scale=_scale(result),
-        agreement=[records.AgreementMetrics(**asdict(each)) for each in result.agreements],
+        agreement=[*result.agreements],
         confidence=records.ConfidenceMetrics.of(
             run=result.confidence,
             shape=result.shape,
@@ -120,7 +122,7 @@ def _sequence(result: Estimate, sequence: FrameSequence) -> records.SequenceMetr
         bridged=_stretches(drive.interpolated),
         doubled=_stretches(dict.fromkeys(drive.doubled, DOUBLED)),
         unreadable_scans=_stretches(scans),
-        segments=[records.Stretch(**asdict(segment)) for segment in drive.segments],
+        segments=[*drive.segments],
         fixed_share=_NOTHING_FIXED
         if drive.measured.fixed is None
         else float(drive.measured.fixed.mean()),
@@ -135,15 +137,15 @@ def _motion(result: Estimate) -> records.MotionMetrics:
     begins = seconds[seconds <= seconds[-1] - window]
     ahead = np.interp(begins + window, seconds, path) - path[: len(begins)]
     drive = result.drive
-    stills = (
-        ends for ends, each in drive.steps.items() if each.relative_pose.source == STILL_SOURCE
+    standing = sum(
+        each.relative_pose.source == STILL_SOURCE and to - start == 1
+        for (start, to), each in drive.steps.items()
     )
-    steps = {ends for ends in stills if ends[1] - ends[0] == 1}
     return records.MotionMetrics.of(
         path=float(path[-1]),
         mean_speed=float(path[-1] / span),
         top_speed=float(ahead.max() / window),
-        standing_share=len(steps) / (len(path) - 1) if drive.support is not None else _BY_MAPS,
+        standing_share=standing / (len(path) - 1) if drive.support is not None else _BY_MAPS,
     )
 
 
@@ -187,19 +189,15 @@ def _graph(result: Estimate) -> records.GraphMetrics:
     """Size of the graph, and coverage of its noise by the truth at the graph's scale."""
     if isinstance(result.graph, Failed):
         return records.GraphMetrics.unknown(result.graph.reason)
-    nodes, factors = len(result.optimised), result.graph.relative_poses
-    if result.reference is None:
-        return records.GraphMetrics.of(nodes=nodes, factors=len(factors), coverage=_NO_TRUTH)
-    aligned = umeyama(result.optimised.positions, result.reference.positions, with_scale=True)
-    if not aligned.scale > 0:
-        still = Failed("the estimate does not move: the truth cannot be scaled to it")
-        return records.GraphMetrics.of(nodes=nodes, factors=len(factors), coverage=still)
-    covered = coverage(factors, result.reference.T_world_camera, aligned.scale)
-    by_source = {source: records.CoverageMetrics.of(**shares) for source, shares in covered.items()}
-    overall = by_source.pop("")
-    return records.GraphMetrics(
-        nodes=nodes, factors=len(factors), coverage=overall, coverage_by_source=by_source
-    )
+    factors = result.graph.relative_poses
+    held: dict[str, Any] = {"coverage": _NO_TRUTH}
+    if result.reference is not None:
+        aligned = umeyama(result.optimised.positions, result.reference.positions, with_scale=True)
+        held = {"coverage": _STANDS_STILL}
+        if aligned.scale > 0:
+            by_source = coverage(factors, result.reference.T_world_camera, aligned.scale)
+            held = {"coverage": by_source.pop(""), "coverage_by_source": by_source}
+    return records.GraphMetrics.of(nodes=len(result.optimised), factors=len(factors), **held)
 
 
 def coverage(
@@ -227,10 +225,9 @@ def coverage(
     sources = np.array([edge.source for edge in relative_poses])
     found = {"": {level: float(within.mean()) for level, within in inside.items()}}
     for source in np.unique(sources):
-        ratios = {
-            level: float(within[sources == source].mean()) for level, within in inside.items()
-        }
-        found[str(source)] = {"factors": int((sources == source).sum()), **ratios}
+        own = sources == source
+        ratios = {level: float(within[own].mean()) for level, within in inside.items()}
+        found[str(source)] = {"factors": int(own.sum()), **ratios}
     return found
 
 
@@ -238,11 +235,10 @@ def squared_bound(probability: float, student_t_dof: float) -> float:
     """Quantile of the whitened squared error of six numbers.
 
     For errors by Student's t with ``student_t_dof`` degrees of freedom, whose standard deviations are the sigmas: a
-    quantile of Fisher's F. For normal errors (infinite ``student_t_dof``): a quantile of chi-square.
+    quantile of Fisher's F. For normal errors (infinite ``student_t_dof``) that is one of chi-square.
     """
-    if math.isinf(student_t_dof):
-        return float(chdtri(6, 1.0 - probability))
-    return float(6 * (student_t_dof - 2) / student_t_dof * fdtri(6, student_t_dof, probability))
+    dof = min(student_t_dof, _NORMAL_DOF)
+    return float(6 * (dof - 2) / dof * fdtri(6, dof, probability))
 
 
 def _loops(found: LoopClosures) -> records.LoopMetrics:
@@ -258,7 +254,7 @@ def _loops(found: LoopClosures) -> records.LoopMetrics:
         )
     rejected = found.rejected[:MOST_REJECTED]
     ends = [
-        records.LoopEnds.of(from_=each.from_index, to=each.to_index, reason=each.reason)
+        records.LoopEnds.of(from_=each.ends[0], to=each.ends[1], reason=each.reason)
         for each in rejected
     ]
     return records.LoopMetrics.of(**counts, rejected=ends)
@@ -269,11 +265,11 @@ def _tracking(result: Estimate) -> records.TrackingMetrics | Failed:
     drive = result.drive
     if not drive.by_keyframes:
         return Failed("this drive has no map of keyframes: it is measured from step to step")
-    return records.TrackingMetrics(
+    return records.TrackingMetrics.of(
         keyframes=sum(len(segment.keyframes) for segment in drive.measured.maps),
         maps=len(set(drive.map_poses.component.values())),
         located_frames=len(drive.map_poses.segments),
-        events=[records.Event(**asdict(event)) for event in drive.events],
+        events=[*drive.events],
     )
 
 

@@ -79,9 +79,9 @@ class RunFolder:
         try:
             if output is None:
                 output = _stamped(results, sequence)
+            check_output(output)
             if lock is not None:
                 lock.take(output)
-            check_output(output)
             output.mkdir(parents=True, exist_ok=True)
             # last of all the file by which it is known as a run
             for path in sorted(output.iterdir(), key=lambda path: path.name == METRICS):

@@ -186,7 +186,6 @@ class LoopsFile(Record):
     """``loops.json``, as far as it is read back."""
 
     accepted: list[AcceptedLoop] | None = None
-    rejected_left_out: Count | None = None
 
 
 class LoopMetrics(Record):
@@ -280,11 +279,7 @@ class Metrics(Record):
 
     def evaluated_errors(self) -> dict[str, TrajectoryMetrics]:
         """Errors of the trajectories that have them."""
-        return (
-            {}
-            if self.trajectories.absent
-            else {k: each for k, each in self.all_errors().items() if not each.absent}
-        )
+        return {name: each for name, each in self.all_errors().items() if not each.absent}
 
     @property
     def failure(self) -> str:

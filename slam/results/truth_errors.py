@@ -65,15 +65,10 @@ def depth_truth(sequence: RecordedSequence, reference: FloatArray) -> SurfaceTru
         )
         return Surface(points, np.linalg.norm(points - T_world_camera[:3, 3], axis=1) <= RANGE_M)
 
-    def in_field(
-        points: FloatArray, frames: Indices
-    ) -> Mask:  # all, for the map comes from the same images
-        return np.ones(len(points), dtype=bool)
-
     name = "depth maps" if exact is None else "exact surface"
-    return SurfaceTruth(
-        name, np.array(sequence.true_depth_frames(), np.int64), view, in_field, distance
-    )
+    frames = np.array(sequence.true_depth_frames(), np.int64)
+    # all points are in the field, for the map comes from the same images
+    return SurfaceTruth(name, frames, view, distance=distance)
 
 
 def lidar_truth(
@@ -85,7 +80,7 @@ def lidar_truth(
     images; the accuracy of the map is measured against all. In the field are points within 25 m of a scanner, between
     its lowest and its highest beam.
     """
-    limits: dict[int, tuple[float, float]] = {}  # sines of the lowest and the highest beam
+    limits: dict[int, FloatArray] = {}  # sines of the lowest and the highest beam
 
     def view(frame: int) -> Surface:
         points = readable_scan(sequence, frame)
@@ -94,8 +89,8 @@ def lidar_truth(
         ranges = np.linalg.norm(points, axis=1)
         sines = points[ranges > 1.0, 2] / ranges[ranges > 1.0]
         # stray points left out
-        beams = np.quantile(sines, [0.001, 0.999]) if len(sines) else (1.0, -1.0)
-        limits[frame] = float(beams[0]), float(beams[1])
+        known = len(sines) > 0
+        limits[frame] = np.quantile(sines, [0.001, 0.999]) if known else np.array([1.0, -1.0])
         points = apply(T_camera_lidar, points[ranges <= RANGE_M])
         return Surface(apply(reference[frame], points), _in_image(points, sequence.intrinsics))
 
@@ -154,9 +149,8 @@ def map_errors(
     fits = {"with_scale": pose_similarity(sequence.reference, poses)}
     if result.scale.is_metric:
         fits["rigid"] = pose_similarity(sequence.reference, poses, with_scale=False)
-    looked_at = np.concatenate(
-        [*stretches(sequence.reference, truth.frames), np.empty(0, np.int64)]
-    ).astype(np.int64)
+    parts = stretches(sequence.reference, truth.frames)
+    looked_at = np.concatenate([*parts, np.empty(0, np.int64)])
     cameras = cKDTree(sequence.reference[looked_at, :3, 3])
     placed = {name: _placed(pieces(), fit, cameras) for name, fit in fits.items()}
     try:
@@ -256,7 +250,8 @@ def projected(
     """z-depth ``(H, W)`` of LiDAR points ``(P, 3)`` in the image, the nearest at each pixel, 0 where there is none."""
     points = apply(T_camera_lidar, points_lidar)
     points = points[_in_image(points, intrinsics)]
+    points = points[np.argsort(-points[:, 2])]  # of several at one pixel the last one stays
     u, v = np.rint(intrinsics.project(points)).astype(int).T
-    depth = np.full((intrinsics.height, intrinsics.width), np.inf, np.float32)
-    np.minimum.at(depth, (v, u), points[:, 2].astype(np.float32))
-    return np.where(np.isfinite(depth), depth, np.float32(0))
+    depth = np.zeros((intrinsics.height, intrinsics.width), np.float32)
+    depth[v, u] = points[:, 2]
+    return depth

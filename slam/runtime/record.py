@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import asdict, is_dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -30,7 +31,7 @@ class Record(BaseModel):
     """Part of a JSON file. A value that is not known is None, in the file null beside ``<key>_reason``.
 
     A part that is missing as a whole has no value, and ``absent`` says why. A number that is not
-    finite is not known. JSON's own kinds are not converted; keys without a field are not read.
+    finite is not known. JSON's own kinds are not converted, dataclasses are; keys without a field are not read.
     """
 
     model_config = ConfigDict(strict=True, frozen=True, populate_by_name=True, allow_inf_nan=False)
@@ -43,6 +44,8 @@ class Record(BaseModel):
     def _with_reasons(cls, content: Any) -> Any:
         if isinstance(content, Failed):
             return {"absent": content.reason}
+        if is_dataclass(content) and not isinstance(content, type):
+            content = asdict(content)
         if not isinstance(content, dict):
             if isinstance(content, cls):
                 return content

@@ -56,7 +56,7 @@ def read_gps(path: Path) -> GpsTrack:
             f"{path} is XML, such as GPX, or NMEA, which are not read: convert it to CSV ({','.join(_NEEDED)})"
         )
     try:
-        found = _fixes(text.splitlines(), path)
+        found = _fixes(text.splitlines())
     except csv.Error as error:
         raise SequenceError(f"{path} cannot be read as a GPS track: {error}") from error
     if not found:
@@ -94,7 +94,7 @@ def read_gps(path: Path) -> GpsTrack:
     return GpsTrack(table[:, 0], table[:, 1:4], table[:, 4], table[:, 5])
 
 
-def _fixes(lines: list[str], path: Path) -> list[tuple[int, list[float]]]:
+def _fixes(lines: list[str]) -> list[tuple[int, list[float]]]:
     """Lines with stamp, latitude, longitude, altitude, dilution, speed in m/s.
 
     NaN where a row is no fix, and where a track has no altitude or no speed.
@@ -112,8 +112,8 @@ def _fixes(lines: list[str], path: Path) -> list[tuple[int, list[float]]]:
             names["speed"], unit = name, _SPEED_UNITS[letters]
     missing = [name for name in _NEEDED if name not in names]
     if missing:
-        raise SequenceError(
-            f"{path} lacks {', '.join(missing)}: its first row must name {', '.join(_NEEDED)}"
+        raise csv.Error(
+            f"it lacks {', '.join(missing)}: its first row must name {', '.join(_NEEDED)}"
         )
     rows = []
     for row in reader:

@@ -97,13 +97,9 @@ def merge(names: Iterable[str]) -> list[str]:
             others.add(str(FrameRange.parse(name)))
         else:
             seeds |= set(range(span[0], span[1] + 1))
-    runs: list[list[int]] = []
-    for seed in sorted(seeds):
-        if runs and runs[-1][-1] + 1 == seed:
-            runs[-1].append(seed)
-        else:
-            runs.append([seed])
-    ranges = [f"simulated/{r[0]}" if len(r) == 1 else f"simulated/{r[0]}-{r[-1]}" for r in runs]
+    firsts = sorted(seed for seed in seeds if seed - 1 not in seeds)
+    lasts = sorted(seed for seed in seeds if seed + 1 not in seeds)
+    ranges = [f"simulated/{a}" if a == b else f"simulated/{a}-{b}" for a, b in zip(firsts, lasts)]
     return ranges + sorted(others)
 
 

@@ -74,7 +74,6 @@ class BundleAdjustment:
         sightings: Sightings,
         intrinsics: Intrinsics,
         free: NDArray[np.bool_],
-        pixel_sigma: float = PIXEL_SIGMA,
         robust: float = _ROBUST,
     ) -> None:
         """Prepare to adjust cameras and points.
@@ -83,10 +82,9 @@ class BundleAdjustment:
             sightings: of the points by the cameras.
             intrinsics: of all cameras.
             free: cameras that are adjusted ``(K,)``; the others stay.
-            pixel_sigma: of a sighting, pixels.
             robust: sigmas beyond which residuals weigh less.
         """
-        self._seen, self._pixel_sigma, self._robust = sightings, pixel_sigma, robust
+        self._seen, self._robust = sightings, robust
         self._focal = np.array([intrinsics.fx, intrinsics.fy])
         self._rays = intrinsics.rays(sightings.pixels)[:, :2]
         self._log_depth = np.log(sightings.depth)
@@ -152,7 +150,7 @@ class BundleAdjustment:
             damping *= 10.0
             if damping > _MOST_DAMPING:
                 break
-        pixel = np.linalg.norm(residuals[:, :2], axis=1) * self._pixel_sigma
+        pixel = np.linalg.norm(residuals[:, :2], axis=1) * PIXEL_SIGMA
         return Adjusted(
             T, X, np.where(self._in_cameras(T, X)[:, 2] > LEAST_DEPTH, pixel, np.inf), cost
         )
@@ -162,7 +160,7 @@ class BundleAdjustment:
         X = self._in_cameras(T_camera_world, points)
         z = np.maximum(X[:, 2:], LEAST_DEPTH)
         found = np.empty((len(X), 3))
-        found[:, :2] = (X[:, :2] / z - self._rays) * self._focal / self._pixel_sigma
+        found[:, :2] = (X[:, :2] / z - self._rays) * self._focal / PIXEL_SIGMA
         found[:, 2] = self._relief(np.log(z[:, 0]) - self._log_depth)
         return found
 
@@ -194,7 +192,7 @@ class BundleAdjustment:
         """Derivatives of the residuals by their camera's perturbation ``(6, 3, S)`` and their point ``(3, 3, S)``."""
         X = self._in_cameras(T_camera_world, points)
         by_camera = np.zeros((6, 3, len(X)))
-        by_camera[:, :2] = pixel_jacobian(X, self._focal / self._pixel_sigma)
+        by_camera[:, :2] = pixel_jacobian(X, self._focal / PIXEL_SIGMA)
         scale = self._learned / (self._depth_sigma * np.maximum(X[:, 2], LEAST_DEPTH))
         by_camera[0, 2], by_camera[1, 2], by_camera[5, 2] = X[:, 1] * scale, -X[:, 0] * scale, scale
         by_point = np.empty((3, 3, len(X)))

@@ -61,11 +61,11 @@ class KeyframePoses:
             if self.component.get(k + 1) == number
         }
 
-    def relates(self, first: int) -> bool:
-        """Whether the frames before ``first`` and the frames from it on have poses in one map."""
+    def across(self, first: int) -> float | None:
+        """The distance of the last frame before ``first`` and the next one that have poses; None without one map."""
         before = max((frame for frame in self.segments if frame < first), default=-1)
         after = min((frame for frame in self.segments if frame >= first), default=-1)
-        return _have_one(self.segments, before, after)
+        return self.length(before, after)
 
     def length(self, first: int, last: int) -> float | None:
         """The distance of two frames; None where no map has both."""

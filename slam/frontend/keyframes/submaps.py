@@ -22,7 +22,6 @@ from slam.frontend.keyframes.local_map import (
     OUTLIER_PX,
     LocalMap,
     Parallax,
-    TrackedFrame,
     TrackedKeyframe,
     TrackIds,
 )
@@ -232,6 +231,8 @@ def join(
     keyframes = united.keyframes
     tracks = _merged_tracks(keyframes, len(united.points), shared)
     joined = _renumbered(united, tracks)
+    lonely = np.isnan(joined.points[tracks, 0]) & np.isfinite(joined.points[:, 0])
+    joined.points[tracks[lonely]] = joined.points[lonely]
     everything = range(len(keyframes))
     for limit in _OUTLIER_LIMITS:
         seen = np.isfinite(joined.points[:, 0])
@@ -279,19 +280,14 @@ def moved(segment: LocalMap, T_world_camera: FloatArray, scales: FloatArray) -> 
 
 def _united(segments: Sequence[LocalMap]) -> LocalMap:
     """The maps in one, with tracks numbered one map after the other."""
-    keyframes: list[TrackedKeyframe] = []
-    frames: list[TrackedFrame] = []
-    turns: list[RelativePose] = []
-    first = 0
+    united = LocalMap(started=True)
     for segment in segments:
-        for keyframe in segment.keyframes:
-            keyframes.append(replace(keyframe, track_ids=keyframe.track_ids + first))
-        for frame in segment.frames:
-            frames.append(replace(frame, track_ids=frame.track_ids + first))
-        first += len(segment.points)
-        turns += segment.turns
-    points = np.concatenate([segment.points for segment in segments])
-    return LocalMap(keyframes, points, frames, True, turns)
+        numbered = _renumbered(segment, len(united.points) + np.arange(len(segment.points)))
+        united.keyframes += numbered.keyframes
+        united.frames += numbered.frames
+        united.turns += numbered.turns
+        united.points = np.concatenate([united.points, segment.points])
+    return united
 
 
 def _merged_tracks(
@@ -318,12 +314,10 @@ def _merged_tracks(
 
 
 def _renumbered(segment: LocalMap, tracks: TrackIds) -> LocalMap:
+    """The map with other numbers of its tracks, whose points stay."""
     keyframes = []
     for keyframe in segment.keyframes:
-        merged = tracks[keyframe.track_ids]
-        keyframes.append(keyframe.with_corners(np.argsort(merged), merged))
-    points = segment.points.copy()
-    lonely = np.flatnonzero(np.isnan(points[tracks, 0]) & np.isfinite(points[:, 0]))
-    points[tracks[lonely]] = points[lonely]
+        numbers = tracks[keyframe.track_ids]
+        keyframes.append(keyframe.with_corners(np.argsort(numbers), numbers))
     frames = [replace(frame, track_ids=tracks[frame.track_ids]) for frame in segment.frames]
-    return LocalMap(keyframes, points, frames, True, segment.turns)
+    return LocalMap(keyframes, segment.points, frames, True, segment.turns)

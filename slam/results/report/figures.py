@@ -70,14 +70,10 @@ def trajectories_figure(
             for loop in loops
         ]
         marker = {"symbol": "circle-open", "size": 9, "color": COLOURS[1]}
-        look = {
-            "mode": "markers",
-            "name": "Loops",
-            "marker": marker,
-            "text": text,
-            "hoverinfo": "text",
-        }
-        figure.add_trace(go.Scatter(x=_single(at[:, 0]), y=_single(at[:, 2]), **look))
+        x, _, z = map(_single, at.T)
+        figure.add_scatter(
+            x=x, y=z, mode="markers", name="Loops", marker=marker, text=text, hoverinfo="text"
+        )
     figure.update_xaxes(title=f"x, right ({unit})")
     figure.update_yaxes(title=f"z, ahead ({unit})", scaleanchor="x")
     return figure.update_layout(height=_MAP, hovermode="closest", dragmode="pan")
@@ -104,8 +100,8 @@ def map_figure(view: MapView) -> go.Figure:
         **_by_axis("xyz", map(_single, path.T)), mode="lines", line=line, hoverinfo="skip"
     )
     # a unit of the scene is what is near, for it is clipped at a hundredth of one
-    low = np.min([np.min(points, axis=0), np.min(path, axis=0)], axis=0)
-    high = np.max([np.max(points, axis=0), np.max(path, axis=0)], axis=0)
+    shown = np.concatenate([points, path])
+    low, high = shown.min(axis=0), shown.max(axis=0)
     size = np.maximum(high - low, 1e-3)
     eye, forward = path[view.frame], R_UP_WORLD @ view.T_world_camera[view.frame, :3, 2]
     places = {"eye": eye, "center": eye + view.ahead * forward}
@@ -213,17 +209,9 @@ def motion_figure(
         figure.add_trace(_line(name, seconds, speed, frames, "%{y:.3f} at %{x:.1f} s"), 1, 1)
     angles = np.unwrap(Rotation.from_matrix(last.T_world_camera[:, :3, :3]).as_euler("YXZ"), axis=0)
     for name, colour, values in zip(("Yaw", "Pitch", "Roll"), COLOURS[1:], np.rad2deg(angles).T):
-        words = f"frame %{{customdata}}: {name} %{{y:.2f}} deg at %{{x:.1f}} s<extra></extra>"
-        line = {
-            "name": name,
-            "line": {"color": colour, "width": 1.6},
-            "hovertemplate": words,
-            "mode": "lines",
-        }
         frames, seconds = _frames(last, drawn), last.stamps - last.stamps[0]
-        figure.add_trace(
-            go.Scatter(x=_single(seconds), y=_single(values), customdata=frames, **line), 2, 1
-        )
+        words, look = "%{y:.2f} deg at %{x:.1f} s", {"color": colour, "width": 1.6}
+        figure.add_trace(_line(name, seconds, values, frames, words, line=look), 2, 1)
     return _over_time(figure, last, gaps)
 
 
@@ -320,12 +308,7 @@ def thinned_mesh(path: Path, triangles: int) -> Mesh:
     if len(mesh.triangles) > triangles:
         mesh = mesh.simplify_quadric_decimation(triangles)
         mesh = mesh.remove_degenerate_triangles().remove_unreferenced_vertices()
-    colours = (
-        np.asarray(mesh.vertex_colors)
-        if mesh.has_vertex_colors()
-        else np.full_like(mesh.vertices, 0.5)
-    )
-    rgb = np.rint(255.0 * np.clip(colours, 0.0, 1.0)).astype(np.uint8)
+    rgb = np.rint(255.0 * np.clip(mesh.vertex_colors, 0.0, 1.0)).astype(np.uint8)
     return np.asarray(mesh.vertices), rgb, np.asarray(mesh.triangles).astype(np.int64)
 
 

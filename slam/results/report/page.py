@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -125,7 +126,13 @@ def _plots(
     if trajectories:
         found["trajectories"] = _trajectory_plots(metrics, trajectories, loops, has_truth)
     if has_truth:
-        found["errors"] = _error_plots(metrics, trajectories)
+        caption = "Distance to the true position, after the 7-dof alignment."
+        title = "Position error along the path"
+        found["errors"].append(_plot(title, caption, figures.error_figure, trajectories))
+        if metrics.trajectories.optimised.align.dof7.t_rel_percent is not None:
+            caption = "Mean relative error of all segments of a length; the scale is that of the 7-dof alignment."
+            title = "Drift by the length of segments"
+            found["errors"].append(_plot(title, caption, figures.drift_figure, trajectories))
     if view is not None:
         caption = (
             f"The map, thinned, and the camera's path, seen first from its place at frame {view.frame}. "
@@ -164,20 +171,6 @@ def _trajectory_plots(
     caption = f"Lengths of stretches of 1/25 of the path, {how}; rotation after it. Interpolated frames are shaded."
     is_metric = metrics.is_metric
     return [above, _plot(title, caption, figures.scale_figure, trajectories, is_metric, gaps)]
-
-
-def _error_plots(metrics: Metrics, trajectories: Mapping[str, Trajectory]) -> list[Picture]:
-    """Errors along the path and, where there are long segments, by their lengths."""
-    from slam.results.report import figures
-
-    caption = "Distance to the true position, after the 7-dof alignment."
-    title = "Position error along the path"
-    found = [_plot(title, caption, figures.error_figure, trajectories)]
-    if metrics.trajectories.optimised.align.dof7.t_rel_percent is not None:
-        caption = "Mean relative error of all segments of a length; the scale is that of the 7-dof alignment."
-        title = "Drift by the length of segments"
-        found.append(_plot(title, caption, figures.drift_figure, trajectories))
-    return found
 
 
 def _plot(title: str, caption: str, draw: Callable[..., Figure], *given: Any) -> Picture:
@@ -264,10 +257,10 @@ def _joined(first: Image, second: Image, ends: NDArray[np.floating]) -> Image:
     joined = np.ascontiguousarray(np.vstack([left, right]) if wide else np.hstack([left, right]))
     shift = np.array([[0, 0], [0, left.shape[0]] if wide else [_WIDTH_PX, 0]])
     ends = (ends + shift)[:: max(1, -(-len(ends) // _MOST_LINES))]
-    for k, line in enumerate(np.rint(ends).astype(int).tolist()):
-        cv2.line(joined, line[0], line[1], _LINES[k % len(_LINES)], 1, cv2.LINE_AA)
-        for place in line:
-            cv2.circle(joined, place, 2, _LINES[k % len(_LINES)], 1, cv2.LINE_AA)
+    for (start, end), colour in zip(np.rint(ends).astype(int).tolist(), cycle(_LINES)):
+        cv2.line(joined, start, end, colour, 1, cv2.LINE_AA)
+        for place in (start, end):
+            cv2.circle(joined, place, 2, colour, 1, cv2.LINE_AA)
     return joined
 
 

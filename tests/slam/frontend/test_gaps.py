@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
 from oracle import snippets_of
 
-from slam.frames import RelativePose, SnippetPoses
+from slam.frames import KEYFRAME_SOURCE, RelativePose, SnippetPoses
 from slam.frontend.gaps import INTERPOLATED_SOURCE, Filled, interpolate_gaps
+from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.measured import Measured
 from slam.frontend.network_motion import chain_raw
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert
+from slam.graph.pose_graph import PoseGraph
 from slam.runtime.errors import SlamError
 
 COUNT = 40
@@ -110,6 +113,39 @@ def test_a_step_over_a_gap_is_divided_into_equal_ones():
         chain(np.array(inside))[-1], over_gap.relative_pose.T_from_to, atol=1e-9
     )
     assert found.steps[14, 25] is over_gap
+
+
+@pytest.mark.parametrize("is_one_map", [True, False])
+def test_a_long_gap_ends_where_one_map_says(is_one_map: bool):
+    """The camera was carried 2 m aside during 30 blank frames; constant velocity knows nothing of that."""
+    blank, count = set(range(20, 50)), 60
+    after = np.arange(count) >= 20
+    centres = np.outer(np.arange(count), [0.01, 0.0, 0.0]) + np.outer(after, [0.0, 2.0, 1.0])
+    truth = from_rotation_vector(np.outer(after, [0.3, 0.8, 0.1]), centres)
+    mapped = [k for k in range(count) if k not in blank]
+    numbers = {k: 0 if is_one_map or k < 20 else 1 for k in mapped}
+    by_map = []
+    for first, last in pairwise(mapped):
+        if numbers[first] == numbers[last]:
+            T = invert(truth[first]) @ truth[last]
+            sigmas = np.full(6, max(0.02 * np.linalg.norm(T[:3, 3]), 1e-3))
+            by_map.append(RelativePose(first, last, T, sigmas, KEYFRAME_SOURCE))
+    recorded = Measured(
+        snippets_of(truth, unusable=blank),
+        roads=[None] * count,
+        unusable=dict.fromkeys(blank, "blank"),
+    )
+    guesses = interpolate_gaps(recorded, 4, (), KeyframePoses(by_map, numbers)).gap_steps
+    graph = PoseGraph()
+    graph.add_relative(*guesses, *by_map)
+    start = np.tile(np.eye(4), (count, 1, 1))
+    for pose in [*guesses, *by_map]:
+        start[pose.to_index] = start[pose.from_index] @ pose.T_from_to
+    found = invert(start[0]) @ graph.optimise(start)
+    errors = np.linalg.norm((found - invert(truth[0]) @ truth)[mapped, :3, 3], axis=1)
+    assert (errors.max() < 0.01) == is_one_map
+    sigmas = [pose.sigmas[3] for pose in guesses if pose.to_index in blank]
+    np.testing.assert_allclose(sigmas, 0.5 * (2.27 if is_one_map else 0.01), rtol=0.01)
 
 
 def test_steps_measured_by_image_geometry_are_not_interpolated():

@@ -180,7 +180,7 @@ def test_a_contradicted_loop_is_refused():
         [*true, loop(6, 206, ring(), shift=8.0)], Track.of_drive(ring()), OF_FRAMES
     )
     assert [k.ends for k in kept] == [k.ends for k in true]
-    assert [r.from_index for r in refused] == [6] and "contradicted by 7 of 7" in refused[0].reason
+    assert [r.ends[0] for r in refused] == [6] and "contradicted by 7 of 7" in refused[0].reason
 
 
 def test_a_loop_without_support_needs_many_inliers():

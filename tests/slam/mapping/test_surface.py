@@ -116,9 +116,10 @@ def test_only_holes_that_look_upwards_are_closed(up: tuple[float, float, float],
         [[6 * i + j, 6 * (i + 1) + j, 6 * (i + 1) + j + 1, 6 * i + j + 1] for i, j in squares]
     )
     triangles = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
-    sheet = TileSurface(vertices, triangles, np.ones(48, dtype=bool), np.zeros(48, dtype=bool))
+    sheet = TileSurface(vertices, triangles, np.ones(48, dtype=bool), 36)
     full = with_holes_closed(sheet, np.zeros(3, np.int64), 0.2, np.array(up), 1.5)
-    assert len(full.vertices) - 36 == closed and full.filled.sum() == 4 * closed and full.own.all()
+    assert len(full.vertices) - 36 == closed and len(full.triangles) - 48 == 4 * closed
+    assert full.observed == 36 and full.own.all()
     np.testing.assert_allclose(full.vertices[36:], np.tile([1.5, 1.5, 1.0], (closed, 1)))
     normals = np.cross(
         *(full.vertices[full.triangles[:, k]] - full.vertices[full.triangles[:, 0]] for k in (1, 2))

@@ -120,11 +120,11 @@ def _index(
 
 def _depth_maps(paths: list[Path], unknown: int = 0) -> dict[int, ArrayReader]:
     """In millimetres, of the frames whose files are there."""
-    maps: dict[int, ArrayReader] = {}
-    for k, path in enumerate(paths):
-        if path.is_file():
-            maps[k] = partial(read_depth_map, path, 1000.0, unknown)
-    return maps
+    return {
+        k: partial(read_depth_map, path, 1000.0, unknown)
+        for k, path in enumerate(paths)
+        if path.is_file()
+    }
 
 
 def _truth(path: Path, stamps: FloatArray) -> FloatArray | None:

@@ -256,7 +256,7 @@ class Interior:
         for x in _middles(x0, x1):
             for y in _middles(y0, y1):
                 lamp = self.site.moved(x - 0.25, y - 0.15, room.height - 0.06)
-                lamp.box((0, 0, 0.001), (0.5, 0.3, 0.05), bulb)
+                lamp.box((0.5, 0.3, 0.05), bulb, (0, 0, 0.001))
                 self._lights.append((x, y, room.height - 0.3, strength))
 
 

@@ -138,15 +138,19 @@ class Site:
         self.patch(points, lattice((0.0, width), (0.0, height)), instance)
 
     def box(
-        self, low: tuple[float, ...], size: tuple[float, ...], look: int, top: int = -1
+        self,
+        size: tuple[float, ...],
+        look: int,
+        low: tuple[float, ...] = (0.0, 0.0, 0.0),
+        top: int = -1,
     ) -> None:
         """Walls and a lid from the lowest corner at the place, and a floor where that is above it.
 
         Args:
-            low: the lowest corner ``(3,)``.
             size: along the place's axes ``(3,)``.
             look: an instance.
-            top: that of the lid, if another.
+            low: the lowest corner ``(3,)``.
+            top: instance of the lid, if another.
         """
         x, y, z = np.array(size)[:, None] * self.frame[:3]
         corner = self.moved(*low).origin
@@ -160,7 +164,7 @@ class Site:
 
     def plate(self, low: tuple[float, ...], size: tuple[float, ...], front: int, rest: int) -> None:
         """A box that shows ``front`` on the side that leaves the wall, a hair before the box."""
-        self.box(low, size, rest)
+        self.box(size, rest, low)
         corner = self.moved(low[0] + size[0], low[1] + size[1] + 0.002, low[2]).origin
         self.quad(corner, -size[0] * self.frame[0], size[2] * self.frame[2], front)
 

@@ -22,7 +22,8 @@ T = TypeVar("T")
 _Kind = TypeVar("_Kind", bound=np.generic)
 Image = NDArray[np.uint8]
 Grey = NDArray[np.uint8]
-DepthMap = NDArray[np.float32]
+Float32Array = NDArray[np.float32]
+DepthMap = Float32Array
 Mask = NDArray[np.bool_]
 Descriptors = NDArray[np.uint8]
 Event = Literal["map begun", "lost", "relocalised", "map joined"]  # of the tracking of keyframes
@@ -231,9 +232,9 @@ class View:
     """
 
     index: int
-    pixels: NDArray[np.float32]
+    pixels: Float32Array
     descriptors: Descriptors
-    points: NDArray[np.float32]
+    points: Float32Array
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -345,7 +346,7 @@ def trusted_depth(depth: FloatArray, height: float | None) -> FloatArray:
     return depth if height is None else np.where(depth < _TRUSTED_HEIGHTS * height, depth, np.nan)
 
 
-def sampled_depth(depth: DepthMap, u: NDArray[np.float32], v: NDArray[np.float32]) -> DepthMap:
+def sampled_depth(depth: DepthMap, u: Float32Array, v: Float32Array) -> DepthMap:
     """Depth of a map ``(H, W)``, not positive or not finite where unknown, at columns and rows ``(h, w)``.
 
     Linear in 1/depth, which is exact on planes, where the four pixels around are known and of one surface; elsewhere
@@ -384,7 +385,7 @@ def resized_mask(mask: Mask, width: int, height: int) -> Mask:
     return np.asarray(resized, bool)
 
 
-def shrunk(grey: Grey, ratio: int) -> NDArray[np.float32]:
+def shrunk(grey: Grey, ratio: int) -> Float32Array:
     """Grey levels ``(h, w)`` of an image of ``ratio`` times this size.
 
     Without the last rows and columns that fill no pixel: whole pixels are averaged ten times as fast.
@@ -394,14 +395,12 @@ def shrunk(grey: Grey, ratio: int) -> NDArray[np.float32]:
     return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
-def slopes_of(image: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+def slopes_of(image: Float32Array) -> list[Float32Array]:
     """Derivatives of an image ``(H, W)`` along its rows and columns, grey levels a pixel."""
     return [
         np.asarray(cv2.Sobel(image, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8)) for dx in (1, 0)
     ]
 
 
-def _nearest(
-    values: NDArray[np.float32], u: NDArray[np.float32], v: NDArray[np.float32]
-) -> NDArray[np.float32]:
+def _nearest(values: Float32Array, u: Float32Array, v: Float32Array) -> Float32Array:
     return cv2.remap(values, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)

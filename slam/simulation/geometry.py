@@ -5,11 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.frames import Float32Array
 from slam.geometry import se3
-
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
-IntArray = NDArray[np.int64]
+from slam.geometry.se3 import FloatArray
 
 PARAMETERS = 6  # of a texture
 

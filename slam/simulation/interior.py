@@ -11,8 +11,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.geometry.se3 import FloatArray
 from slam.simulation.furniture import STANDING, TALL, Piece, dining
-from slam.simulation.geometry import FLAT, FloatArray, luck, unit
+from slam.simulation.geometry import FLAT, luck, unit
 from slam.simulation.shapes import UP, Rectangle, Site, lattice
 
 WALL = 0.14  # thickness, metres

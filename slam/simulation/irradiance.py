@@ -4,8 +4,10 @@ import functools
 
 import numpy as np
 
+from slam.frames import Float32Array
+from slam.geometry.se3 import FloatArray, IntArray
 from slam.runtime.imports import import_open3d
-from slam.simulation.geometry import Float32Array, FloatArray, IntArray, luck, unit
+from slam.simulation.geometry import luck, unit
 from slam.simulation.interior import interior_of
 from slam.simulation.room_textures import GLOWING
 from slam.simulation.world import MATERIALS, Surface

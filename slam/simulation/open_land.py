@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from slam.geometry.se3 import FloatArray
 from slam.simulation import objects
-from slam.simulation.geometry import FloatArray
 from slam.simulation.options import StreetKind
 from slam.simulation.route import KERB
 from slam.simulation.shapes import Rectangle, Site, grid_over

@@ -5,10 +5,11 @@ import functools
 import cv2
 import numpy as np
 
-from slam.frames import Intrinsics
+from slam.frames import Float32Array, Intrinsics
 from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
 from slam.simulation.carried import Carried, Floor
-from slam.simulation.geometry import Float32Array, FloatArray, Mesh, luck
+from slam.simulation.geometry import Mesh, luck
 from slam.simulation.interior import interior_of
 from slam.simulation.irradiance import GLOW, irradiance_of
 from slam.simulation.objects import person

@@ -7,16 +7,15 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from slam.geometry import se3
+from slam.geometry.se3 import BoolArray, FloatArray
 from slam.runtime.errors import SequenceError
-from slam.simulation.geometry import Bend, FloatArray, luck, road_bend, town_bend, unit
+from slam.simulation.geometry import Bend, luck, road_bend, town_bend, unit
 from slam.simulation.options import StreetKind, Variety
 
 Node = tuple[int, int]
-BoolArray = NDArray[np.bool_]
 
 STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))  # from a node to its neighbours
 KERB = 0.13  # height of pavements above the road, metres

@@ -12,16 +12,9 @@ from numpy.typing import ArrayLike
 
 from erfsfm.common.config_tree import parse_yaml
 from erfsfm.common.files import read_text
-from slam.simulation.geometry import (
-    FLAT,
-    PARAMETERS,
-    Bend,
-    Float32Array,
-    FloatArray,
-    IntArray,
-    Mesh,
-    unit,
-)
+from slam.frames import Float32Array
+from slam.geometry.se3 import FloatArray, IntArray
+from slam.simulation.geometry import FLAT, PARAMETERS, Bend, Mesh, unit
 from slam.simulation.world import MATERIALS
 
 Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.formats.ply import Ply, distances, scene_of
-from slam.frames import Intrinsics
+from slam.frames import Float32Array, Intrinsics
 from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
 from slam.runtime.imports import import_open3d
-from slam.simulation.geometry import Float32Array, FloatArray, Mesh
+from slam.simulation.geometry import Mesh
 from slam.simulation.options import SimulationOptions
 from slam.simulation.room_textures import ROOM_SHADERS
 from slam.simulation.street_textures import STREET_SHADERS

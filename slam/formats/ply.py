@@ -157,7 +157,7 @@ def write_ply_pieces(
 
 def _elements(header: str) -> dict[str, tuple[int, list[tuple[Any, ...]]]]:
     """Count and fields of the elements by name; of a list as many values as a triangle has corners."""
-    elements: dict[str, tuple[int, list[tuple[Any, ...]]]] = {}
+    elements = {}
     fields: list[tuple[Any, ...]] = []
     for line in header.splitlines():
         match line.split():

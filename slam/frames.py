@@ -23,6 +23,7 @@ _Kind = TypeVar("_Kind", bound=np.generic)
 Image = NDArray[np.uint8]
 Grey = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
+Pixels = NDArray[np.floating[Any]]
 DepthMap = Float32Array
 Mask = NDArray[np.bool_]
 Descriptors = NDArray[np.uint8]
@@ -98,7 +99,7 @@ class Frame:
         known: T = self._derived[key]
         return known
 
-    def is_fixed(self, pixels: NDArray[np.floating[Any]]) -> BoolArray:
+    def is_fixed(self, pixels: Pixels) -> BoolArray:
         """Which pixels ``(M, 2)`` show what is fixed to the camera ``(M,)``."""
         if self.fixed is None:
             return np.zeros(len(pixels), np.bool_)
@@ -328,14 +329,14 @@ def runs(frames: Collection[int]) -> list[tuple[int, int]]:
     return list(zip(sorted(firsts), sorted(lasts)))
 
 
-def nearest(values: NDArray[_Kind], pixels: NDArray[np.floating[Any]]) -> NDArray[_Kind]:
+def nearest(values: NDArray[_Kind], pixels: Pixels) -> NDArray[_Kind]:
     """Values ``(M,)`` of a map ``(H, W)`` at the pixels nearest to points ``(M, 2)``."""
     u, v = np.clip(np.rint(pixels).astype(np.int64), 0, np.array(values.shape[::-1]) - 1).T
     found: NDArray[_Kind] = values[v, u]
     return found
 
 
-def nearest_depth(depth: DepthMap, pixels: NDArray[np.floating[Any]]) -> FloatArray:
+def nearest_depth(depth: DepthMap, pixels: Pixels) -> FloatArray:
     """Depth ``(M,)`` of a map ``(H, W)`` at the pixels nearest to points ``(M, 2)``, NaN where it is unknown."""
     found = nearest(depth, pixels).astype(np.float64)
     return np.where(np.isfinite(found) & (found > 0), found, np.nan)

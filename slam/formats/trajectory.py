@@ -33,7 +33,7 @@ _WANTED = "a pose a row"
 # Largest |R R^T - I| or | |q| - 1 | that counts as rounding in a file and is repaired.
 _ROTATION_TOLERANCE = 1e-3
 _FARTHEST = 1e12  # metres: to Saturn
-_SAME_STAMP = 0.05  # of the period: stamps of one image differ by less
+_SAME_STAMP = 0.1  # of the tolerance: stamps of one image differ by less
 _UNITS = {1: "milliseconds", 2: "microseconds", 3: "nanoseconds"}  # by powers of 1000
 _UNIT_TOLERANCE = 0.2  # of such a power: one of the two covers a quarter at least
 _LEAST_OF_OTHER_UNIT = 10  # matching rows, which are by chance
@@ -226,7 +226,7 @@ def associate(
         )
     pair = estimate.select(rows_estimate), reference.select(rows_reference)
     apart = np.abs(pair[0].stamps - pair[1].stamps).max()
-    if apart <= _SAME_STAMP * min(_period_s(estimate), _period_s(reference)):
+    if apart <= _SAME_STAMP * tolerance_s:
         return pair
     if _period_s(estimate) < _period_s(reference):
         return estimate.at(pair[1].stamps), pair[1]

@@ -22,7 +22,9 @@ T = TypeVar("T")
 _Kind = TypeVar("_Kind", bound=np.generic)
 Image = NDArray[np.uint8]
 Grey = NDArray[np.uint8]
-DepthMap = NDArray[np.float32]
+Float32Array = NDArray[np.float32]
+Pixels = NDArray[np.floating[Any]]
+DepthMap = Float32Array
 Mask = NDArray[np.bool_]
 Descriptors = NDArray[np.uint8]
 Event = Literal["map begun", "lost", "relocalised", "map joined"]  # of the tracking of keyframes
@@ -97,7 +99,7 @@ class Frame:
         known: T = self._derived[key]
         return known
 
-    def is_fixed(self, pixels: NDArray[np.floating[Any]]) -> BoolArray:
+    def is_fixed(self, pixels: Pixels) -> BoolArray:
         """Which pixels ``(M, 2)`` show what is fixed to the camera ``(M,)``."""
         if self.fixed is None:
             return np.zeros(len(pixels), np.bool_)
@@ -231,9 +233,9 @@ class View:
     """
 
     index: int
-    pixels: NDArray[np.float32]
+    pixels: Float32Array
     descriptors: Descriptors
-    points: NDArray[np.float32]
+    points: Float32Array
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -327,14 +329,14 @@ def runs(frames: Collection[int]) -> list[tuple[int, int]]:
     return list(zip(sorted(firsts), sorted(lasts)))
 
 
-def nearest(values: NDArray[_Kind], pixels: NDArray[np.floating[Any]]) -> NDArray[_Kind]:
+def nearest(values: NDArray[_Kind], pixels: Pixels) -> NDArray[_Kind]:
     """Values ``(M,)`` of a map ``(H, W)`` at the pixels nearest to points ``(M, 2)``."""
     u, v = np.clip(np.rint(pixels).astype(np.int64), 0, np.array(values.shape[::-1]) - 1).T
     found: NDArray[_Kind] = values[v, u]
     return found
 
 
-def nearest_depth(depth: DepthMap, pixels: NDArray[np.floating[Any]]) -> FloatArray:
+def nearest_depth(depth: DepthMap, pixels: Pixels) -> FloatArray:
     """Depth ``(M,)`` of a map ``(H, W)`` at the pixels nearest to points ``(M, 2)``, NaN where it is unknown."""
     found = nearest(depth, pixels).astype(np.float64)
     return np.where(np.isfinite(found) & (found > 0), found, np.nan)
@@ -345,7 +347,7 @@ def trusted_depth(depth: FloatArray, height: float | None) -> FloatArray:
     return depth if height is None else np.where(depth < _TRUSTED_HEIGHTS * height, depth, np.nan)
 
 
-def sampled_depth(depth: DepthMap, u: NDArray[np.float32], v: NDArray[np.float32]) -> DepthMap:
+def sampled_depth(depth: DepthMap, u: Float32Array, v: Float32Array) -> DepthMap:
     """Depth of a map ``(H, W)``, not positive or not finite where unknown, at columns and rows ``(h, w)``.
 
     Linear in 1/depth, which is exact on planes, where the four pixels around are known and of one surface; elsewhere
@@ -384,7 +386,7 @@ def resized_mask(mask: Mask, width: int, height: int) -> Mask:
     return np.asarray(resized, bool)
 
 
-def shrunk(grey: Grey, ratio: int) -> NDArray[np.float32]:
+def shrunk(grey: Grey, ratio: int) -> Float32Array:
     """Grey levels ``(h, w)`` of an image of ``ratio`` times this size.
 
     Without the last rows and columns that fill no pixel: whole pixels are averaged ten times as fast.
@@ -394,14 +396,12 @@ def shrunk(grey: Grey, ratio: int) -> NDArray[np.float32]:
     return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
-def slopes_of(image: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+def slopes_of(image: Float32Array) -> list[Float32Array]:
     """Derivatives of an image ``(H, W)`` along its rows and columns, grey levels a pixel."""
     return [
         np.asarray(cv2.Sobel(image, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8)) for dx in (1, 0)
     ]
 
 
-def _nearest(
-    values: NDArray[np.float32], u: NDArray[np.float32], v: NDArray[np.float32]
-) -> NDArray[np.float32]:
+def _nearest(values: Float32Array, u: Float32Array, v: Float32Array) -> Float32Array:
     return cv2.remap(values, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)

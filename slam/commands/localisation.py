@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from erfsfm.common.errors import DataError
@@ -23,7 +22,7 @@ from slam.geometry.multiview import Resection, consensus, pixel_jacobian, resect
 from slam.geometry.robust import mad_sigma, median
 from slam.geometry.se3 import FloatArray, apply, invert, length_of
 from slam.loops.features import FeatureExtractor, hamming
-from slam.loops.places import Places, PlaceStructure
+from slam.loops.places import Places, PlaceStructure, Rows
 from slam.loops.verification import OF_FRAMES, OF_KEYFRAMES, matches
 from slam.loops.vocabulary import PlaceIndex
 from slam.results.folder import RunFolder
@@ -278,7 +277,7 @@ class Localiser:
             return Localisation(reason=reason, inliers=count)
         return Localisation(T_world_camera=invert(T_camera_world), inliers=count)
 
-    def _start(self, row: int, view: View, learned: bool) -> tuple[FloatArray, NDArray[np.intp]]:
+    def _start(self, row: int, view: View, learned: bool) -> tuple[FloatArray, Rows]:
         """The pose by one place, as `consensus` gives it."""
         corners, seen = matches(self._places.views[row], view, self._thresholds)
         points = self._structure.points(row, learned)[corners]

@@ -218,13 +218,12 @@ class FolderRecorder(Recorder):
         try:
             with self._stopwatch.stage("mesh"):
                 surface = estimate.map.surface(self._progress)
+                self._progress("map files", 0, 1)
+                surface.write_mesh(self.folder.path / MAP_MESH)
+                surface.write_cloud(self.folder.path / MAP_CLOUD)
         except EmptyMapError as error:
             logger.warning("no map: %s", error)
             return Failed(str(error))
-        self._progress("map files", 0, 1)
-        with self._stopwatch.stage("mesh"):
-            surface.write_mesh(self.folder.path / MAP_MESH)
-            surface.write_cloud(self.folder.path / MAP_CLOUD)
         with self._stopwatch.stage("evaluation"):
             metric = estimate.scale.is_metric
             share = (

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.formats.rows import Rows
 from slam.formats.trajectory import translations_and_quaternions
 from slam.frames import Intrinsics
 from slam.geometry.se3 import FloatArray, invert
@@ -36,12 +37,12 @@ _QUATERNION_WXYZ_FIRST = [6, 3, 4, 5, 0, 1, 2]  # of a translation and a quatern
 class Sightings:
     """``frame`` ``(S,)`` sees at ``pixels`` ``(S, 2)`` the ``point`` ``(S,)``, up to ``errors_px`` ``(S,)``."""
 
-    frame: NDArray[np.intp]
+    frame: Rows
     pixels: FloatArray
-    point: NDArray[np.intp]
+    point: Rows
     errors_px: FloatArray
 
-    def of_frames(self) -> dict[int, NDArray[np.intp]]:
+    def of_frames(self) -> dict[int, Rows]:
         """The sightings of each frame that has any."""
         order = np.argsort(self.frame, kind="stable")
         frames, first = np.unique(self.frame[order], return_index=True)
@@ -92,7 +93,7 @@ def _images(
     T_world_camera: FloatArray,
     without_image: Collection[int],
     sightings: Sightings,
-    of_frames: dict[int, NDArray[np.intp]],
+    of_frames: dict[int, Rows],
 ) -> Iterator[tuple[str, bytes]]:
     """Two lines an image, the second of its corners, and the same in binary form."""
     poses = translations_and_quaternions(invert(T_world_camera))[:, _QUATERNION_WXYZ_FIRST]
@@ -113,7 +114,7 @@ def _points(
     points_world: FloatArray,
     colours: NDArray[np.uint8],
     sightings: Sightings,
-    of_frames: dict[int, NDArray[np.intp]],
+    of_frames: dict[int, Rows],
 ) -> Iterator[tuple[str, bytes]]:
     """A line a point with its track: numbers of images, and of corners in them; and the same in binary form."""
     tracks: dict[int, list[tuple[int, int]]] = {}

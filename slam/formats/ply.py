@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.recfunctions import structured_to_unstructured
 from numpy.typing import NDArray
 
 from slam.geometry.se3 import FloatArray, IntArray
@@ -36,26 +37,25 @@ class Ply:
     vertices: NDArray[np.void]
     triangles: IntArray | None = None
 
-    def columns(self, names: tuple[str, ...]) -> FloatArray | None:
-        """Fields of the vertices ``(V, len(names))``; None where the file lacks one of them."""
-        if not set(names) <= set(self.vertices.dtype.names or ()):
-            return None
-        return np.stack([self.vertices[name].astype(np.float64) for name in names], axis=1)
+    def has(self, names: tuple[str, ...]) -> bool:
+        """Whether the vertices have all of these fields."""
+        return set(names) <= set(self.vertices.dtype.names or ())
+
+    def columns(self, names: tuple[str, ...]) -> FloatArray:
+        """Fields of the vertices ``(V, len(names))``; ``KeyError`` where they lack one."""
+        return structured_to_unstructured(self.vertices[list(names)], np.float64)
 
     @property
     def points(self) -> FloatArray:
         """Positions ``(V, 3)``."""
-        return np.stack([self.vertices[name].astype(np.float64) for name in _AXES], axis=1)
+        return self.columns(_AXES)
 
     @property
     def colours(self) -> NDArray[np.uint8]:
         """RGB ``(V, 3)``, a middle grey where the file has none."""
-        colours = self.columns(_COLOURS)
-        return (
-            np.full((len(self.vertices), 3), 128, np.uint8)
-            if colours is None
-            else colours.astype(np.uint8)
-        )
+        if not self.has(_COLOURS):
+            return np.full((len(self.vertices), 3), 128, np.uint8)
+        return self.columns(_COLOURS).astype(np.uint8)
 
 
 def read_ply(path: Path) -> Ply:
@@ -85,9 +85,7 @@ def _checked(content: bytes) -> Ply:
         raise ValueError("it is longer than its header states, or has no vertices")
     faces = parts.get("face")
     ply = Ply(parts["vertex"], None if faces is None else faces["vertices"].astype(np.int64))
-    points, triangles = ply.columns(_AXES), ply.triangles
-    if points is None:
-        raise ValueError("its vertices have no x, y, z")
+    points, triangles = ply.points, ply.triangles
     if not np.isfinite(points).all():
         raise ValueError("a coordinate is not finite")
     if faces is not None and (faces["count"] != 3).any():
@@ -101,9 +99,9 @@ def rotated(ply: Ply, R_up_world: FloatArray) -> Ply:
     """The same with vertices and normals rotated by ``R_up_world`` ``(3, 3)``."""
     vertices = ply.vertices.copy()
     for names in (_AXES, _NORMALS):
-        directions = ply.columns(names)
-        if directions is not None:
-            for name, column in zip(names, (directions @ R_up_world.T).T, strict=True):
+        if ply.has(names):
+            turned = ply.columns(names) @ R_up_world.T
+            for name, column in zip(names, turned.T, strict=True):
                 vertices[name] = column
     return replace(ply, vertices=vertices)
 
@@ -159,7 +157,7 @@ def write_ply_pieces(
 
 def _elements(header: str) -> dict[str, tuple[int, list[tuple[Any, ...]]]]:
     """Count and fields of the elements by name; of a list as many values as a triangle has corners."""
-    elements: dict[str, tuple[int, list[tuple[Any, ...]]]] = {}
+    elements = {}
     fields: list[tuple[Any, ...]] = []
     for line in header.splitlines():
         match line.split():

@@ -19,6 +19,7 @@ from slam.runtime.errors import SlamError
 
 logger = logging.getLogger(__name__)
 
+Rows = NDArray[np.intp]  # of a table, by number
 _LEAST_IN_ORDER = 0.75  # share of the rows; with fewer, nobody knows which of them are out of order
 _MOST_PLACES_LATE = 5
 # digits of milli- and microseconds since 1970, and how many are behind the point
@@ -46,7 +47,7 @@ class BadRows:
         self._reasons.setdefault(line, reason)
 
     def without(
-        self, checks: Sequence[tuple[Any, str]], lines: NDArray[np.intp], *columns: Any
+        self, checks: Sequence[tuple[Any, str]], lines: Rows, *columns: Any
     ) -> tuple[Any, ...]:
         """Lines ``(N,)`` and columns ``(N, ...)`` of the rows that pass all checks ``(N,)``; others have the reason."""
         for is_good, reason in checks:
@@ -55,9 +56,7 @@ class BadRows:
         are_good = np.all([is_good for is_good, _ in checks], axis=0)
         return tuple(column[are_good] for column in (lines, *columns))
 
-    def in_order(
-        self, stamps: NDArray[np.float64], what: str, lines: NDArray[np.intp], wanted: str
-    ) -> NDArray[np.intp]:
+    def in_order(self, stamps: NDArray[np.float64], what: str, lines: Rows, wanted: str) -> Rows:
         """The rows in the order of their stamps ``(N,)``, without repeated ones and those far from their place.
 
         A row a few places late is sorted in, and so are all rows of a table in no order at all. Bad rows are said. A

@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam.formats.rows import BadRows, in_seconds, is_number, number_or_nan, rows_of
+from slam.formats.rows import BadRows, Rows, in_seconds, is_number, number_or_nan, rows_of
 from slam.geometry import se3
 from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray
@@ -34,7 +33,7 @@ _WANTED = "a pose a row"
 # Largest |R R^T - I| or | |q| - 1 | that counts as rounding in a file and is repaired.
 _ROTATION_TOLERANCE = 1e-3
 _FARTHEST = 1e12  # metres: to Saturn
-_SAME_STAMP = 0.05  # of the period: stamps of one image differ by less
+_SAME_STAMP = 0.1  # of the tolerance: stamps of one image differ by less
 _UNITS = {1: "milliseconds", 2: "microseconds", 3: "nanoseconds"}  # by powers of 1000
 _UNIT_TOLERANCE = 0.2  # of such a power: one of the two covers a quarter at least
 _LEAST_OF_OTHER_UNIT = 10  # matching rows, which are by chance
@@ -87,7 +86,7 @@ class Trajectory:
         return self.rows or len(self)
 
     @property
-    def frame_numbers(self) -> NDArray[np.intp]:
+    def frame_numbers(self) -> Rows:
         """``(N,)``: those of the file, else the row numbers."""
         by_stamps = self.numbered or self.rows is not None
         return self.stamps.astype(np.intp) if by_stamps else np.arange(len(self))
@@ -101,7 +100,7 @@ class Trajectory:
         """Interpolated poses of a timed trajectory at stamps ``(M,)``; its ends are held."""
         return Trajectory(stamps, se3.interpolate(self.T_world_camera, self.stamps, stamps))
 
-    def select(self, rows: NDArray[np.intp]) -> Trajectory:
+    def select(self, rows: Rows) -> Trajectory:
         """The poses of some rows, in the order given."""
         return replace(self, stamps=self.stamps[rows], T_world_camera=self.T_world_camera[rows])
 
@@ -227,7 +226,7 @@ def associate(
         )
     pair = estimate.select(rows_estimate), reference.select(rows_reference)
     apart = np.abs(pair[0].stamps - pair[1].stamps).max()
-    if apart <= _SAME_STAMP * min(_period_s(estimate), _period_s(reference)):
+    if apart <= _SAME_STAMP * tolerance_s:
         return pair
     if _period_s(estimate) < _period_s(reference):
         return estimate.at(pair[1].stamps), pair[1]
@@ -296,9 +295,7 @@ def _period_s(trajectory: Trajectory) -> float:
     return median(np.diff(trajectory.stamps)) if len(trajectory) > 1 else _LONE_PERIOD_S
 
 
-def nearest_pairs(
-    a: FloatArray, b: FloatArray, within_s: float
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def nearest_pairs(a: FloatArray, b: FloatArray, within_s: float) -> tuple[Rows, Rows]:
     """Rows of two increasing series of stamps that are each other's nearest and at most ``within_s`` apart.
 
     Args:
@@ -312,14 +309,14 @@ def nearest_pairs(
     return rows_a[chosen], nearest_b[chosen]
 
 
-def nearest_stamps(stamps: FloatArray, candidates: FloatArray) -> NDArray[np.intp]:
+def nearest_stamps(stamps: FloatArray, candidates: FloatArray) -> Rows:
     """For each stamp ``(N,)`` the row of the nearest of the increasing candidates; of two as near the earlier one."""
     return np.searchsorted((candidates[1:] + candidates[:-1]) / 2, stamps)
 
 
 def _read_numbers(
     path: Path, forms: tuple[int, ...], bad: BadRows
-) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
+) -> tuple[Rows, Rows, FloatArray]:
     """Line and row numbers ``(N,)`` of a file, and its table ``(N, columns)`` of the commonest of these forms."""
     table = [(number, _words(line)) for number, line in rows_of(path, TrajectoryError, _WANTED)]
     if table and not any(is_number(word) for word in table[0][1]):

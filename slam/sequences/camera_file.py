@@ -13,6 +13,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -306,13 +307,12 @@ def _orb_slam(content: Keys) -> Keys:
 def _vins(content: Keys) -> Keys:
     _require_pinhole(content, "model_type")
     pinhole = content["projection_parameters"]
-    focal = (pinhole[name] for name in ("fx", "fy", "cx", "cy"))
     lens = content["distortion_parameters"]
     _refuse_others(lens, _VINS_COEFFICIENTS, "VINS")
     return pinhole_keys(
         content["image_width"],
         content["image_height"],
-        *focal,
+        *itemgetter("fx", "fy", "cx", "cy")(pinhole),
         model="opencv",
         distortion=[lens[name] for name in _VINS_COEFFICIENTS],
     )
@@ -387,7 +387,8 @@ class Undistortion:
         )
         pixels = self.intrinsics.pixel_grid()
         seen = self.distort(pixels.reshape(-1, 2), self.intrinsics.K).astype(np.float32)
-        self._maps = cv2.split(seen.reshape(pixels.shape))
+        map_u, map_v = cv2.split(seen.reshape(pixels.shape))
+        self._maps = map_u, map_v
 
     def apply(self, image: Image) -> Image:
         """Undistort an image ``(H, W, 3)``.
@@ -475,10 +476,7 @@ def require_size(images: Sized, camera: CameraFile, where: str) -> None:
         wanted = "they are turned by a quarter, perhaps by their own metadata: turn them back"
     else:
         scaled = camera.pinhole.resized(images.width, images.height)
-        values = ", ".join(
-            f"{name}: {getattr(scaled, name):.6g}" for name in ("fx", "fy", "cx", "cy")
-        )
-        keys = f"width: {images.width}, height: {images.height}, {values}"
+        keys = ", ".join(f"{name}: {value:.6g}" for name, value in vars(scaled).items())
         wanted = f"resize the images, or if they were only resized, scale the file to {{{keys}}}"
     raise SequenceError(
         f"the images of {where} are {images.width}x{images.height}, but the camera file is for "

@@ -31,7 +31,7 @@ from slam.sequences import kitti, layouts, ros
 from slam.sequences.images import ReadImages
 from slam.sequences.loader import IMAGES, VIDEO, Asked, Loader, Opener
 from slam.sequences.poses import read_truth
-from slam.sequences.recording import ArrayReader, RecordedSequence, frame_range
+from slam.sequences.recording import ArrayReaders, RecordedSequence, frame_range
 
 logger = logging.getLogger(__name__)
 
@@ -57,6 +57,7 @@ _PIECES = {
     "ROS bag": (re.compile(r"(?P<head>.*?_?)(?:\d{4}(?:-\d\d){5}_)?(?P<number>\d+)(?P<tail>)"),),
     "images": (re.compile(r"(?P<head>)(?P<number>\d{3})(?P<tail>)"),),
 }
+Contents = dict[str, tuple[str, Opener]]  # kind and opener of each sequence by name
 _NAMED_TO_S = 1.5  # names give whole seconds
 _TRIP_S = 7200.0  # from the beginning of a clip to that of the next, before another trip begins
 _LONGEST_PAUSE = 3.0  # times the usual distance of two pieces, before another drive begins
@@ -115,7 +116,7 @@ def _root(dataset: Path | None, name: str | None) -> Path:
     return path
 
 
-def _contents(root: Path, asked: Asked) -> dict[str, tuple[str, Opener]]:
+def _contents(root: Path, asked: Asked) -> Contents:
     """Kind and opener of what a path holds, pieces of one recording as one; empty where nothing is of a known kind."""
     found = _parts(root, asked)
     for pieces in find_series(_kinds(found)):
@@ -125,11 +126,11 @@ def _contents(root: Path, asked: Asked) -> dict[str, tuple[str, Opener]]:
     return found
 
 
-def _kinds(contents: Mapping[str, tuple[str, Opener]]) -> dict[str, str]:
+def _kinds(contents: Contents) -> dict[str, str]:
     return {name: kind for name, (kind, _) in contents.items()}
 
 
-def _parts(root: Path, asked: Asked) -> dict[str, tuple[str, Opener]]:
+def _parts(root: Path, asked: Asked) -> Contents:
     """What a path holds, or else the folders in it."""
     found = _recognised(root, asked)
     if found or root.is_file():
@@ -148,7 +149,7 @@ def _loaders() -> tuple[Loader, ...]:
     return (*map(import_plug_in, plug_ins(PLUG_INS).values()), *LOADERS)
 
 
-def _recognised(root: Path, asked: Asked) -> dict[str, tuple[str, Opener]]:
+def _recognised(root: Path, asked: Asked) -> Contents:
     for loader in _loaders():
         openers = loader.find(root, asked)
         if openers:
@@ -281,7 +282,7 @@ def open_series(pieces: Sequence[Piece], openers: Sequence[Opener]) -> RecordedS
     ]
 
     sources = []
-    scans: dict[int, ArrayReader] = {}
+    scans: ArrayReaders = {}
     for start, part in zip(starts, parts, strict=True):
         for source in part.sources:
             begin = source.first or 0

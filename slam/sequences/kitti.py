@@ -29,10 +29,10 @@ from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import DEFAULT_FPS, find_camera_file
 from slam.sequences.images import ImageFiles
-from slam.sequences.loader import Asked, Loader, Opener
+from slam.sequences.loader import Asked, Loader, Openers
 from slam.sequences.poses import poses_near
 from slam.sequences.recording import (
-    ArrayReader,
+    ArrayReaders,
     RecordedSequence,
     Source,
     read_stamps,
@@ -247,7 +247,7 @@ def T_world_imu(packets: FloatArray, ages_s: FloatArray) -> FloatArray:
 
 def _readers(
     read: Callable[[Path], FloatArray], folder: Path, pattern: str, files: NumberedFiles
-) -> dict[int, ArrayReader]:
+) -> ArrayReaders:
     """Readers of the files of a folder by frame, by the numbers of the images."""
     paths = (path for path in folder.glob(pattern) if path.stem.isdecimal())
     return {int(path.stem) - files.first: partial(read, path) for path in paths}
@@ -271,7 +271,7 @@ def _distance_to_mesh(path: Path) -> Callable[[FloatArray], FloatArray] | None:
     return lambda points: distances(scene(), points)
 
 
-def _find_odometry(path: Path, asked: Asked) -> dict[str, Opener]:
+def _find_odometry(path: Path, asked: Asked) -> Openers:
     """The sequences of a root, or the one whose own folder is given."""
     root, where = kitti.find_odometry_root(path), path.absolute()
     if root is not None:
@@ -285,7 +285,7 @@ def _find_odometry(path: Path, asked: Asked) -> dict[str, Opener]:
     return {name: partial(_open_odometry, root, name, asked.camera) for name in names}
 
 
-def _find_raw(path: Path, asked: Asked) -> dict[str, Opener]:
+def _find_raw(path: Path, asked: Asked) -> Openers:
     return {
         name: partial(_open_raw, drive, asked.camera)
         for name, drive in kitti.find_drives(path).items()

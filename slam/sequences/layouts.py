@@ -37,10 +37,10 @@ from slam.sequences.camera_file import (
     read_opencv_yaml,
 )
 from slam.sequences.images import ImageFiles
-from slam.sequences.loader import Asked, Loader, Opener
+from slam.sequences.loader import Asked, Loader, Openers
 from slam.sequences.poses import pose_files, poses_near, poses_of, read_matrix
 from slam.sequences.recording import (
-    ArrayReader,
+    ArrayReaders,
     RecordedSequence,
     Source,
     read_stamps,
@@ -118,13 +118,13 @@ def _index(
     return np.array(stamps)[order], [files[k] for k in order]
 
 
-def _depth_maps(paths: list[Path], unknown: int = 0) -> dict[int, ArrayReader]:
+def _depth_maps(paths: list[Path], unknown: int = 0) -> ArrayReaders:
     """In millimetres, of the frames whose files are there."""
-    maps: dict[int, ArrayReader] = {}
-    for k, path in enumerate(paths):
-        if path.is_file():
-            maps[k] = partial(read_depth_map, path, 1000.0, unknown)
-    return maps
+    return {
+        k: partial(read_depth_map, path, 1000.0, unknown)
+        for k, path in enumerate(paths)
+        if path.is_file()
+    }
 
 
 def _truth(path: Path, stamps: FloatArray) -> FloatArray | None:
@@ -138,7 +138,7 @@ def _truth(path: Path, stamps: FloatArray) -> FloatArray | None:
 # EuRoC: mav0/cam0/{data.csv,sensor.yaml,data/STAMP.png}, true poses of the body
 
 
-def _find_euroc(path: Path, asked: Asked) -> dict[str, Opener]:
+def _find_euroc(path: Path, asked: Asked) -> Openers:
     """The left camera, else the right one, of the sensors in ``mav0`` of a recording, or in the folder given."""
     path = path.absolute()
     for body in (path / "mav0", path):
@@ -219,7 +219,7 @@ def _open_tum(folder: Path, asked: Path | None) -> RecordedSequence:
     places, match = (folder, folder.parent), _FREIBURG.search(folder.name)
     is_published = match is not None and beside(*places) is None
     own = partial(_freiburg_camera, match["camera"]) if match is not None and is_published else None
-    depth_maps: dict[int, ArrayReader] = {}
+    depth_maps: ArrayReaders = {}
     if (folder / _TUM_DEPTH).exists():
         known, paths = _index(folder / _TUM_DEPTH, folder)
         for k, row in zip(*nearest_pairs(stamps, known, _NEAR_DEPTH_S)):
@@ -354,7 +354,7 @@ def _open_nuscenes(root: Path, tables: Path, scene: str, asked: Path | None) -> 
         height_m = float(T_ego_camera[2, 3])
         size = front[0]["width"], front[0]["height"]
         keys = pinhole_keys(*size, fx, fy, cx, cy, fps=_NUSCENES_FPS, camera_height_m=height_m)
-        scans: dict[int, ArrayReader] = {}
+        scans: ArrayReaders = {}
         T_camera_lidar = None
         if lidar:
             (T_ego_lidar,) = _nuscenes_poses([lidar[0]["mount"]])
@@ -424,10 +424,10 @@ def _nuscenes_poses(rows: list[Row]) -> FloatArray:
     return poses_of(positions, quaternions[:, [1, 2, 3, 0]])
 
 
-def _find_nuscenes(path: Path, asked: Asked) -> dict[str, Opener]:
+def _find_nuscenes(path: Path, asked: Asked) -> Openers:
     """All scenes of all tables."""
     folders = sorted(folder for folder in path.glob("v1.0-*") if (folder / "scene.json").is_file())
-    scenes: dict[str, Opener] = {}
+    scenes: Openers = {}
     for folder in folders:
         for row in _table(folder, "scene"):
             name = row.get("name") if isinstance(row, dict) else None
@@ -445,7 +445,7 @@ def _loader(
 ) -> Loader:
     """A loader of folders that ``is_one`` recognises, of the one given or of those ``inside`` it."""
 
-    def find(path: Path, asked: Asked) -> dict[str, Opener]:
+    def find(path: Path, asked: Asked) -> Openers:
         path = path.absolute()
         found = (
             [path] if is_one(path) else sorted(filter(is_one, path.glob(inside))) if inside else []

@@ -33,6 +33,7 @@ from slam.sequences.recording import RecordedSequence, Source, read_stamps, unif
 logger = logging.getLogger(__name__)
 
 Opener = Callable[[], RecordedSequence]
+Openers = dict[str, Opener]  # of sequences by name
 TIMES = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv")
 _UNEVEN = 0.25  # of an interval
 _RATE_TOLERANCE = 0.1
@@ -66,7 +67,7 @@ class Loader:
 
     kind: str
     layout: str
-    find: Callable[[Path, Asked], dict[str, Opener]]
+    find: Callable[[Path, Asked], Openers]
 
 
 def open_folder(folder: Path, asked: Path | None) -> RecordedSequence:
@@ -107,7 +108,7 @@ def _times_of_images(places: list[Path], files: NumberedFiles, fps: float) -> Fl
     return uniform_stamps(len(files), fps)
 
 
-def _find_folder(path: Path, asked: Asked) -> dict[str, Opener]:
+def _find_folder(path: Path, asked: Asked) -> Openers:
     if image_folder(path) is None:
         return {}
     return {path.absolute().name: partial(open_folder, path, asked.camera)}
@@ -147,7 +148,7 @@ def _times_of_frames(path: Path, frames: VideoFrames, fps: float) -> FloatArray:
     return shown
 
 
-def _find_video(path: Path, asked: Asked) -> dict[str, Opener]:
+def _find_video(path: Path, asked: Asked) -> Openers:
     files = [path] if path.is_file() else list_videos(path)
     videos = (file for file in files if file.suffix.lower() in VIDEO_SUFFIXES)
     return {clip_name(video): partial(open_video, video, asked.camera) for video in videos}

@@ -37,6 +37,7 @@ _USUAL_PERIODS_S = (1e-3, 5.0)
 _RIGID_TOLERANCE = 0.01
 _LONG_PAUSE_S, _LONG_PAUSE_PERIODS = 30.0, 50.0
 ArrayReader = Callable[[], NDArray[Any]]
+ArrayReaders = dict[int, ArrayReader]  # by frame
 
 
 @dataclass(frozen=True)
@@ -87,8 +88,8 @@ class RecordedSequence:
     T_any_camera: FloatArray | None = None
     usual_height_m: InitVar[float | None] = None
     T_camera_lidar: FloatArray | None = None
-    scans: dict[int, ArrayReader] = field(default_factory=dict)
-    depth_maps: dict[int, ArrayReader] = field(default_factory=dict)
+    scans: ArrayReaders = field(default_factory=dict)
+    depth_maps: ArrayReaders = field(default_factory=dict)
     distance_to_surface: Callable[[FloatArray], FloatArray] | None = None
     intrinsics: Intrinsics = field(init=False)
     undistortion: Undistortion | None = field(default=None, init=False)

@@ -24,9 +24,9 @@ from slam.sequences import bag as bags
 from slam.sequences.bag import Bag, is_bag, is_rectified
 from slam.sequences.camera_file import find_camera_file
 from slam.sequences.images import ReadImages
-from slam.sequences.loader import Asked, Loader, Opener
+from slam.sequences.loader import Asked, Loader, Openers
 from slam.sequences.poses import poses_near, poses_of
-from slam.sequences.recording import ArrayReader, RecordedSequence, Source
+from slam.sequences.recording import ArrayReaders, RecordedSequence, Source
 
 logger = logging.getLogger(__name__)
 
@@ -320,7 +320,7 @@ def _poses(messages: StampedMessages) -> tuple[FloatArray, FloatArray]:
 
 def _scans(
     bag: Bag, mounts: Mounts, camera: str, stamps: FloatArray
-) -> tuple[FloatArray | None, dict[int, ArrayReader]]:
+) -> tuple[FloatArray | None, ArrayReaders]:
     """``T_camera_lidar`` and clouds of the first LiDAR whose mount is known.
 
     A frame has the cloud nearest to it, if within 50 ms and not nearer to another frame.
@@ -342,11 +342,11 @@ def _scans(
     return None, {}
 
 
-def _find(path: Path, asked: Asked) -> dict[str, Opener]:
+def _find(path: Path, asked: Asked) -> Openers:
     """The cameras of a bag by topic; those of a folder of bags by bag, and by topic where a bag has several."""
     if not is_bag(path):
         paths = sorted(filter(is_bag, path.iterdir())) if path.is_dir() else []
-        found: dict[str, Opener] = {}
+        found: Openers = {}
         for bag in paths:
             cameras = _cameras(bag, asked)
             for topic, opener in cameras.items():
@@ -363,7 +363,7 @@ def _find(path: Path, asked: Asked) -> dict[str, Opener]:
     return cameras
 
 
-def _cameras(path: Path, asked: Asked) -> dict[str, Opener]:
+def _cameras(path: Path, asked: Asked) -> Openers:
     """The cameras of a bag by topic."""
     topics, stem = camera_topics(path), path.absolute().stem
     names = [stem + topic.replace("/", "_") if len(topics) > 1 else stem for topic in topics]

@@ -15,7 +15,8 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial.transform import Rotation
 
 from slam.geometry import se3
-from slam.simulation.geometry import FloatArray, IntArray, luck
+from slam.geometry.se3 import FloatArray, IntArray
+from slam.simulation.geometry import luck
 from slam.simulation.interior import Interior
 
 CELL = 0.08  # of the floor, metres

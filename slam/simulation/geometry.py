@@ -5,11 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.frames import Float32Array
 from slam.geometry import se3
-
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
-IntArray = NDArray[np.int64]
+from slam.geometry.se3 import FloatArray
 
 PARAMETERS = 6  # of a texture
 
@@ -50,9 +48,7 @@ class Bend:
     amplitudes: FloatArray  # of the sway in x and in y and of the hills, metres, (3,)
     wavelengths: FloatArray  # of the same, metres, (3,)
     phases: FloatArray  # of the same, radians, (3, 2)
-    # x, y and heading of a lone road every metre from road_start on, (M, 3)
-    road: FloatArray | None = None
-    road_start: float = 0.0  # plan x of its first row
+    road: FloatArray | None = None  # plan x, and x, y and heading there, of a lone road, (M, 4)
 
     def __call__(self, points: FloatArray) -> FloatArray:
         """Map plan points ``(..., 3)`` to the street frame."""
@@ -67,8 +63,7 @@ class Bend:
             sway_x = self.amplitudes[0] * np.sin(k[0] * y + self.phases[0, 0])
             sway_y = self.amplitudes[1] * np.sin(k[1] * x + self.phases[1, 0])
             return np.stack([x + sway_x, y + sway_y, z + hill], axis=-1)
-        steps = np.arange(len(self.road)) + self.road_start
-        centre_x, centre_y, heading = se3.interpolated(x, steps, self.road).T
+        centre_x, centre_y, heading = se3.interpolated(x, self.road[:, 0], self.road[:, 1:]).T
         return np.stack(
             [centre_x - y * np.sin(heading), centre_y + y * np.cos(heading), z + hill], axis=-1
         )
@@ -77,7 +72,7 @@ class Bend:
 FLAT = Bend(np.zeros(3), np.ones(3), np.zeros((3, 2)))  # the plan as it is
 
 
-def town_bend(rng: np.random.Generator, hills: tuple[float, float] | None = None) -> Bend:
+def town_bend(rng: np.random.Generator, hills: tuple[float, float] | None) -> Bend:
     """Streets that sway by a few degrees over hills.
 
     The hills are gentle, or of a steepness (rise over run) and a wavelength in metres.
@@ -94,7 +89,7 @@ def town_bend(rng: np.random.Generator, hills: tuple[float, float] | None = None
 
 
 def road_bend(
-    rng: np.random.Generator, start: float, end: float, hills: tuple[float, float] | None = None
+    rng: np.random.Generator, start: float, end: float, hills: tuple[float, float] | None
 ) -> Bend:
     """A road whose heading wanders within about 35 degrees, at a radius of about 80 m or more."""
     town = town_bend(rng, hills)
@@ -110,7 +105,7 @@ def road_bend(
             * np.sin(2 * np.pi * s / wavelength + rng.uniform(0, 6.28))
         )
     position = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], 1), axis=0)
-    return replace(town, road=np.column_stack([position, heading]), road_start=float(s[0]))
+    return replace(town, road=np.column_stack([s, position, heading]))
 
 
 def unit(rows: FloatArray) -> FloatArray:

@@ -11,8 +11,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.geometry.se3 import FloatArray
 from slam.simulation.furniture import STANDING, TALL, Piece, dining
-from slam.simulation.geometry import FLAT, FloatArray, luck, unit
+from slam.simulation.geometry import FLAT, luck, unit
 from slam.simulation.shapes import UP, Rectangle, Site, lattice
 
 WALL = 0.14  # thickness, metres
@@ -256,7 +257,7 @@ class Interior:
         for x in _middles(x0, x1):
             for y in _middles(y0, y1):
                 lamp = self.site.moved(x - 0.25, y - 0.15, room.height - 0.06)
-                lamp.box((0, 0, 0.001), (0.5, 0.3, 0.05), bulb)
+                lamp.box((0.5, 0.3, 0.05), bulb, (0, 0, 0.001))
                 self._lights.append((x, y, room.height - 0.3, strength))
 
 

@@ -4,8 +4,10 @@ import functools
 
 import numpy as np
 
+from slam.frames import Float32Array
+from slam.geometry.se3 import FloatArray, IntArray
 from slam.runtime.imports import import_open3d
-from slam.simulation.geometry import Float32Array, FloatArray, IntArray, luck, unit
+from slam.simulation.geometry import luck, unit
 from slam.simulation.interior import interior_of
 from slam.simulation.room_textures import GLOWING
 from slam.simulation.world import MATERIALS, Surface
@@ -14,6 +16,8 @@ _RAYS = 48  # around a corner
 _BOUNCES = 3
 _ALBEDO = 0.55
 _REACH_M = 9.0  # of a lamp
+# of each material
+GLOW = np.array([GLOWING.get(material, 0.0) for material in MATERIALS], dtype=np.float32)
 
 
 @functools.lru_cache(maxsize=2)
@@ -54,7 +58,7 @@ def irradiance_of(seed: int, some_are_dim: bool) -> Float32Array:
         fade = strength * cosine[near] / (1.0 + 0.35 * distance[near] ** 2)
         direct[near] += np.where(blocked, 0.0, fade)
     hit = _around(surface, points, normal)
-    shining = np.isin(mesh.material, [MATERIALS.index(material) for material in GLOWING])
+    shining = GLOW[mesh.material] > 0.0
     total = direct
     for _ in range(_BOUNCES):
         thrown = np.where(shining, 1.2, _ALBEDO * total[triangles].mean(axis=1))

@@ -21,18 +21,18 @@ def building(site: Site, width: float, depth: float) -> None:
     look = (floor, spacing, window_width, rng.uniform(1.1, 1.7), style, height)
     wall = site.instance("wall", plaster, trim, look)
     roof = site.instance("roof", "roof")
-    site.box((0, 0, 0), (width, depth, height), wall, roof)
+    site.box((width, depth, height), wall, top=roof)
     if rng.random() < 0.65:
         _gable(site, (width, depth, height), wall, roof)
     if rng.random() < 0.4:  # a bay or porch in front
         w = rng.uniform(0.2, 0.4) * width
         x = rng.uniform(0.5, width - w - 0.5)
         top = rng.uniform(0.6, 1.0) * height if floors > 1 else 2.6
-        site.box((x, -0.9, 0), (w, 0.9, top), wall, roof)
+        site.box((w, 0.9, top), wall, (x, -0.9, 0), roof)
     if rng.random() < 0.5:  # a chimney
         x, y = rng.uniform(0.2, 0.8) * width, rng.uniform(0.3, 0.7) * depth
         stone = site.instance("wall", 0.8 * plaster, trim, (99.0, 99.0, 0.0, 0.0, 1.0, height))
-        site.box((x, y, height), (0.8, 0.8, 3.0), stone)
+        site.box((0.8, 0.8, 3.0), stone, (x, y, height))
 
 
 def _gable(site: Site, size: tuple[float, float, float], wall: int, roof: int) -> None:
@@ -88,7 +88,7 @@ def hedge(site: Site, length: float) -> None:
         plain = (99.0, 99.0, 0.0, 0.0, 1.0, height)  # without windows
         look = site.instance("wall", "garden wall", 1.0, plain)
         thick = 0.3
-    site.box((0, 0, 0), (length, thick, height), look)
+    site.box((length, thick, height), look)
 
 
 def lamp(site: Site) -> None:
@@ -108,7 +108,7 @@ def sign(site: Site) -> None:
     half = site.rng.uniform(0.3, 0.45)
     kind = float(site.rng.integers(3))
     plate = site.instance("sign", paint, (0.92, 0.92, 0.90), (half, kind))
-    site.box((-0.06, -half, height), (0.02, 2 * half, 2 * half), plate)
+    site.box((0.02, 2 * half, 2 * half), plate, (-0.06, -half, height))
 
 
 def fence(site: Site, length: float) -> None:
@@ -132,7 +132,7 @@ def barrier(site: Site, length: float, concrete: bool) -> None:
     look = site.instance("gravel" if concrete else "metal", "barrier", 0.8)
     if concrete:
         for along in np.arange(0.0, length - 3.9, 4.0).tolist():
-            site.moved(along).box((0, -0.15, 0), (4.0, 0.3, 0.9), look)
+            site.moved(along).box((4.0, 0.3, 0.9), look, (0, -0.15, 0))
     else:
         _rails(site, length, 4.0, 0.75, (0.06, 0.15), [0.8], look)
 
@@ -194,7 +194,7 @@ def bonnet(site: Site, below: float, height_m: float) -> None:
     """
     far = min(site.rng.uniform(1.1, 2.0), 0.6 * height_m / max(below, 0.05))
     paint = site.instance("metal", "bonnet")
-    site.box((-1.1, below * far, 0.25), (2.2, 1.0, far - 0.25), paint)
+    site.box((2.2, 1.0, far - 0.25), paint, (-1.1, below * far, 0.25))
 
 
 def car(site: Site) -> None:
@@ -209,7 +209,7 @@ def car(site: Site) -> None:
     van = rng.random() < 0.2
     waist = rng.uniform(0.82, 0.98)
     roof = rng.uniform(1.38, 1.6) + (0.45 if van else 0.0)
-    site.box((-length / 2, -half, 0.25), (length, 2 * half, waist - 0.25), paint)
+    site.box((length, 2 * half, waist - 0.25), paint, (-length / 2, -half, 0.25))
     hood = rng.uniform(0.10, 0.16) if van else rng.uniform(0.2, 0.3)
     low = (-0.48 * length, (0.5 - hood) * length)
     high = (low[0] + (0.1 if van else rng.uniform(0.2, 0.8)), low[1] - rng.uniform(0.5, 0.8))

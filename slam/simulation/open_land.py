@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from slam.geometry.se3 import FloatArray
 from slam.simulation import objects
-from slam.simulation.geometry import FloatArray
 from slam.simulation.options import StreetKind
 from slam.simulation.route import KERB
 from slam.simulation.shapes import Rectangle, Site, grid_over
@@ -54,7 +54,7 @@ def _edge(site: Site, kind: StreetKind, length: float) -> None:
             objects.barrier(site, length, luck < 0.25)
         elif luck < 0.87:  # against the noise
             wall = site.instance("boards", "noise wall", 0.6, (0.5,))
-            site.box((0, 0, 0), (length, 0.3, site.rng.uniform(2.5, 5.0)), wall)
+            site.box((length, 0.3, site.rng.uniform(2.5, 5.0)), wall)
     elif luck < 0.3:
         objects.fence(site, length)
     elif luck < 0.6:

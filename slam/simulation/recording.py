@@ -15,12 +15,12 @@ from erfsfm.common.progress import Progress, silent
 from erfsfm.common.readers.camera_file import CameraFile, Pinhole
 from slam.formats.ply import write_ply
 from slam.formats.trajectory import Trajectory, write_kitti
+from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import write_camera
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.images import ReadImages
 from slam.sequences.recording import RecordedSequence, Source, frame_range, uniform_stamps
-from slam.simulation.geometry import FloatArray
 from slam.simulation.options import VERSION, SimulationOptions
 from slam.simulation.rooms import SimulatedRooms
 from slam.simulation.street import SimulatedStreet

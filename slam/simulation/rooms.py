@@ -5,17 +5,17 @@ import functools
 import cv2
 import numpy as np
 
-from slam.frames import Intrinsics
+from slam.frames import Float32Array, Intrinsics
 from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
 from slam.simulation.carried import Carried, Floor
-from slam.simulation.geometry import Float32Array, FloatArray, Mesh, luck
+from slam.simulation.geometry import Mesh, luck
 from slam.simulation.interior import interior_of
-from slam.simulation.irradiance import irradiance_of
+from slam.simulation.irradiance import GLOW, irradiance_of
 from slam.simulation.objects import person
 from slam.simulation.options import SimulationOptions
-from slam.simulation.room_textures import GLOWING
 from slam.simulation.shapes import things
-from slam.simulation.world import MATERIALS, Hits, SimulatedWorld, Surface, between, place_rays
+from slam.simulation.world import Hits, SimulatedWorld, Surface, between, place_rays
 
 STILL_S = 3.0
 _USUAL_FOV_DEG = 65.0
@@ -30,7 +30,6 @@ _MOST_OPEN = 0.9  # of the time between frames, of the shutter
 _METER_S = 0.1  # the meter's period
 _METERED = 12  # how often it is read
 _METER_WEIGHTS = np.exp(-_METER_S * np.arange(_METERED) / 0.35)  # the newest reading first
-_GLOW = np.array([GLOWING.get(material, 0.0) for material in MATERIALS], dtype=np.float32)
 
 
 class SimulatedRooms(SimulatedWorld):
@@ -99,7 +98,7 @@ class SimulatedRooms(SimulatedWorld):
         if hits.surface is not self._still:  # people are lit as the house is in the mean
             return rgb * self._irradiance.mean() * (0.85 + 0.15 * hits.normals[2])
         light = between(np.take(self._irradiance, hits.triangle, axis=1), hits.barycentric)
-        glow = _GLOW[np.take(self._still.mesh.material, hits.triangle)]
+        glow = GLOW[np.take(self._still.mesh.material, hits.triangle)]
         return rgb * np.where(glow > 0.0, glow, light)
 
     def _develop(self, rgb: Float32Array, index: int) -> Float32Array:

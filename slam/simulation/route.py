@@ -7,16 +7,15 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from slam.geometry import se3
+from slam.geometry.se3 import BoolArray, FloatArray
 from slam.runtime.errors import SequenceError
-from slam.simulation.geometry import Bend, FloatArray, luck, road_bend, town_bend, unit
+from slam.simulation.geometry import Bend, luck, road_bend, town_bend, unit
 from slam.simulation.options import StreetKind, Variety
 
 Node = tuple[int, int]
-BoolArray = NDArray[np.bool_]
 
 STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))  # from a node to its neighbours
 KERB = 0.13  # height of pavements above the road, metres
@@ -49,7 +48,7 @@ class StreetPlan:
     streets: BoolArray
     half_width: float  # of every street, metres
     drive: tuple[Node, ...]  # nodes in the order in which the camera passes them
-    kind: StreetKind = "town"  # of streets and what stands beside them
+    kind: StreetKind  # of streets and what stands beside them
 
     @property
     def driven(self) -> FloatArray:
@@ -129,7 +128,7 @@ def town_plan(
     drive: list[Node],
     spacing: float,
     side_streets: float,
-    kind: StreetKind = "town",
+    kind: StreetKind,
 ) -> StreetPlan:
     """Lay streets under a drive over nodes, smallest coordinates zero, and some more beside it.
 
@@ -153,7 +152,7 @@ def town_plan(
     return StreetPlan(lines[0], lines[1], streets, half_width, tuple(shifted), kind)
 
 
-def road_plan(rng: np.random.Generator, length: float, kind: StreetKind = "town") -> StreetPlan:
+def road_plan(rng: np.random.Generator, length: float, kind: StreetKind) -> StreetPlan:
     """One street along x with side streets, long enough to drive ``length`` metres."""
     shortest, longest, side_streets, widths = _ROADS[kind]
     gaps = rng.uniform(shortest, longest, int(length / shortest) + 3)

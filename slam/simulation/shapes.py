@@ -12,16 +12,9 @@ from numpy.typing import ArrayLike
 
 from erfsfm.common.config_tree import parse_yaml
 from erfsfm.common.files import read_text
-from slam.simulation.geometry import (
-    FLAT,
-    PARAMETERS,
-    Bend,
-    Float32Array,
-    FloatArray,
-    IntArray,
-    Mesh,
-    unit,
-)
+from slam.frames import Float32Array
+from slam.geometry.se3 import FloatArray, IntArray
+from slam.simulation.geometry import FLAT, PARAMETERS, Bend, Mesh, unit
 from slam.simulation.world import MATERIALS
 
 Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1
@@ -134,19 +127,23 @@ class Site:
     def quad(self, corner: FloatArray, along: FloatArray, up: FloatArray, instance: int) -> None:
         """Add one parallelogram, textured in metres from its corner."""
         points = np.stack([[corner, corner + along], [corner + up, corner + along + up]])
-        width, height = np.linalg.norm(along), np.linalg.norm(up)
+        width, height = (float(np.linalg.norm(side)) for side in (along, up))
         self.patch(points, lattice((0.0, width), (0.0, height)), instance)
 
     def box(
-        self, low: tuple[float, ...], size: tuple[float, ...], look: int, top: int = -1
+        self,
+        size: tuple[float, ...],
+        look: int,
+        low: tuple[float, ...] = (0.0, 0.0, 0.0),
+        top: int = -1,
     ) -> None:
         """Walls and a lid from the lowest corner at the place, and a floor where that is above it.
 
         Args:
-            low: the lowest corner ``(3,)``.
             size: along the place's axes ``(3,)``.
             look: an instance.
-            top: that of the lid, if another.
+            low: the lowest corner ``(3,)``.
+            top: instance of the lid, if another.
         """
         x, y, z = np.array(size)[:, None] * self.frame[:3]
         corner = self.moved(*low).origin
@@ -160,7 +157,7 @@ class Site:
 
     def plate(self, low: tuple[float, ...], size: tuple[float, ...], front: int, rest: int) -> None:
         """A box that shows ``front`` on the side that leaves the wall, a hair before the box."""
-        self.box(low, size, rest)
+        self.box(size, rest, low)
         corner = self.moved(low[0] + size[0], low[1] + size[1] + 0.002, low[2]).origin
         self.quad(corner, -size[0] * self.frame[0], size[2] * self.frame[2], front)
 

@@ -9,9 +9,11 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from slam.frames import Float32Array
 from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
 from slam.runtime.imports import import_open3d
-from slam.simulation.geometry import Float32Array, FloatArray, Mesh, luck
+from slam.simulation.geometry import Mesh, luck
 from slam.simulation.objects import bonnet, car
 from slam.simulation.options import USUAL, SimulationOptions, draw_variety
 from slam.simulation.route import STEP, Route, plan_route

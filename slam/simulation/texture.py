@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.simulation.geometry import Float32Array
+from slam.frames import Float32Array
 
 Lengths = NDArray[np.floating[Any]]
 Octave = tuple[float, float, float]  # of noise: wavelength along u and along v, metres; amplitude

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.formats.ply import Ply, distances, scene_of
-from slam.frames import Intrinsics
+from slam.frames import Float32Array, Intrinsics
 from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
 from slam.runtime.imports import import_open3d
-from slam.simulation.geometry import Float32Array, FloatArray, Mesh
+from slam.simulation.geometry import Mesh
 from slam.simulation.options import SimulationOptions
 from slam.simulation.room_textures import ROOM_SHADERS
 from slam.simulation.street_textures import STREET_SHADERS
@@ -130,7 +131,6 @@ class SimulatedWorld(ABC):
 
     camera_height_m: float | None = None
     T_camera_lidar: FloatArray | None = None
-    _still: Surface  # every one that stands still
 
     def __init__(
         self, options: SimulationOptions, camera: Intrinsics, T_scene_camera: FloatArray
@@ -145,6 +145,11 @@ class SimulatedWorld(ABC):
         self._rays = camera.rays(camera.pixel_grid()).reshape(-1, 3).astype(np.float32)
         # ray length per depth
         self._stretch = np.linalg.norm(self._rays, axis=1).astype(np.float32)
+
+    @property
+    @abstractmethod
+    def _still(self) -> Surface:
+        """Every surface that stands still."""
 
     @abstractmethod
     def _moving(self, index: int) -> list[Mesh]:

@@ -15,7 +15,9 @@ from slam.simulation.street import SimulatedStreet
 def test_kitti_root_holds_what_was_rendered(tmp_path: Path):
     street = SimulatedStreet(SimulationOptions("straight", 3, 712, 208, 64))
     root, written = tmp_path / "deep" / "world", []
-    write_kitti_root(street, root, depth=True, lidar=True, progress=lambda *said: written.append(said[1]))
+    write_kitti_root(
+        street, root, depth=True, lidar=True, progress=lambda *said: written.append(said[1])
+    )
     assert written == [1, 2, 3]
     assert sorted(p.name for p in root.iterdir()) == [
         "camera.yaml",

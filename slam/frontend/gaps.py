@@ -79,11 +79,9 @@ def interpolate_gaps(
     trusted = [snippet for snippet in measured.snippets if _is_trusted(snippet, frozen, cuts)]
     single = (pose for pose in _poses(steps) if pose.to_index == pose.from_index + 1)
     by_image = {pose.from_index: pose.T_from_to for pose in single}
+    covered = calibration.scaled(network_steps(trusted)) | by_image
     # snippets of frozen images alone are still the best estimate available
-    known = calibration.scaled(network_steps(trusted)) | by_image or by_network
-    covered = set(by_image)
-    for snippet in trusted:
-        covered.update(range(min(snippet.sources), max(snippet.sources)))
+    known = covered or by_network
     loose = [k for k in range(count - 1) if k not in covered]
     motion = _completed(known, loose)
     for pose in _poses(steps):  # over gaps

@@ -33,10 +33,9 @@ _LEAST_PATH_OVER_DEPTH = 0.75
 _LEAST_GAP_FRAMES = 30  # least distance of the two frames of a loop, frames
 _TRIED_FIRST = 4  # candidates of a view of which one must be verified before the others are tried
 _SAME_PLACE = 0.05  # of the least path of a loop: 0.75 m
-_BLOCK = 256
 # loops nearby that agree, by which one corrects the unit between two parts of a map as far as it will
 _OVERRULING = 3
-Apart = Callable[[NDArray[np.intp]], NDArray[np.bool_]]
+Apart = Callable[[int], NDArray[np.bool_]]
 _SUPPORT_SIGMAS = 3.0  # largest difference of supporting loops, sigmas
 # drift of the odometry between supporting loops over the path between them
 _SUPPORT_DRIFT_RATIO = 0.1
@@ -109,9 +108,9 @@ def close_loops(
     track, least = Track.of_drive(T_world_camera), _least_path(views, is_metric)
     frames = _frames(views)
 
-    def apart(rows: NDArray[np.intp]) -> NDArray[np.bool_]:
-        is_later = frames[rows, None] - frames >= _LEAST_GAP_FRAMES
-        return is_later & (track.path[frames][rows, None] - track.path[frames] >= least)
+    def apart(row: int) -> NDArray[np.bool_]:
+        is_later = frames[row] - frames >= _LEAST_GAP_FRAMES
+        return is_later & (track.path[frames[row]] - track.path[frames] >= least)
 
     closures = find_loops(views, track, apart, LoopVerifier(OF_FRAMES, intrinsics, seed))
     return replace(
@@ -209,25 +208,22 @@ def find_candidates(
 
     Args:
         views: in time order.
-        apart: says of some views ``(B,)``, by their rows, and of all views whether they may make a
-            loop ``(B, V)``.
+        apart: says of a view, by its row, with which views it may make a loop ``(V,)``.
         thresholds: how many candidates a view has, how similar, and how far from each other.
     """
     if len(views) < 2 or not any(map(len, views)):
         return []
     weighted = PlaceIndex(views).weights
-    indices = _frames(views)
-    rows = np.arange(len(views))
+    indices, by_word = _frames(views), weighted.T.tocsr()
     neighbour = np.asarray((weighted[1:] * weighted[:-1]).sum(axis=1)).ravel()
     expected = np.maximum(np.concatenate([neighbour[:1], neighbour]), 1e-3)
     candidates = []
-    for start in range(0, len(views), _BLOCK):
-        block = rows[start : start + _BLOCK]
-        scores = (weighted[block] @ weighted.T).toarray() / expected[block, None]  # (block, V)
-        scores[~apart(block) | (rows >= block[:, None])] = 0.0
-        for later, row in zip(block, scores, strict=True):
-            for rank, k in enumerate(_peaks(row, indices, thresholds)):
-                candidates.append(Candidate(k, int(later), float(row[k]), rank))
+    for later in range(1, len(views)):
+        scores = (weighted[[later]] @ by_word).toarray()[0] / expected[later]
+        scores[later:] = 0.0
+        scores[~apart(later)] = 0.0
+        for rank, k in enumerate(_peaks(scores, indices, thresholds)):
+            candidates.append(Candidate(k, later, float(scores[k]), rank))
     return candidates
 
 

@@ -11,12 +11,19 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from slam.frames import LOOP_SOURCE, Ends, Intrinsics, RelativePose, View
 from slam.geometry.multiview import consensus, resect
 from slam.geometry.robust import median
-from slam.geometry.se3 import FloatArray, apply, invert, length_of, make, rotation_angle
+from slam.geometry.se3 import (
+    FloatArray,
+    apply,
+    interpolate,
+    invert,
+    length_of,
+    rotation_angle,
+    tangent,
+)
 from slam.loops.features import hamming
 
 _RATIO = 0.85  # largest ratio of nearest to second nearest descriptor distance
@@ -174,10 +181,8 @@ class LoopVerifier:
             reason = f"both directions differ by {rotation_deg:.1f} degrees and {translation_ratio:.0%} of the depth"
             return refused(reason, inliers)
         T_forward = invert(forward.T_camera_points)
-        apart = Rotation.from_matrix(T_forward[:3, :3].T @ T_again[:3, :3])
-        half = Rotation.from_rotvec(0.5 * apart.as_rotvec())
-        T_middle = make(
-            T_forward[:3, :3] @ half.as_matrix(), 0.5 * (T_forward[:3, 3] + T_again[:3, 3])
+        (T_middle,) = interpolate(
+            np.stack([T_forward, T_again]), np.array([0.0, 1.0]), np.array([0.5])
         )
         again = backward.sigmas * np.repeat([1.0, scale], 3)
         sigmas = self._sigmas(T_middle, depth, difference, forward.sigmas, again)
@@ -224,8 +229,7 @@ class LoopVerifier:
         the sigmas.
         """
         corners = _CORNER_SIGMA_WIDENING * np.hypot(forward, backward)
-        rotation = Rotation.from_matrix(difference[:3, :3]).as_rotvec()
-        disagreement = np.concatenate([rotation, difference[:3, 3]]) / 2
+        disagreement = tangent(difference[None])[0] / 2
         length_sigma = _LENGTH_RELATIVE_SIGMA * length_of(T_a_b[:3, 3])
         translation_floor = np.hypot(self.thresholds.translation_floor_ratio * depth, length_sigma)
         floors = np.repeat([np.deg2rad(self.thresholds.rotation_floor_deg), translation_floor], 3)

@@ -281,17 +281,13 @@ class VisualOdometry:
         step = self._triangulated(ends, seconds, tracks, matches, depth, two_view)
         if step is None:
             return None
-        is_possible = self._history.is_possible_speed(step.speed(height, seconds), seconds)
-        is_doubtful = self._history.is_sudden_loss(step.inlier_ratio) or is_possible is False
-        if is_doubtful and not is_credible(step, matches, height, seconds, self._history):
+        if not is_credible(step, matches, height, self._history):
             return Failed("the step contradicts the road and the steps before")
         self._height = height or self._height
-        self._learn(tracks, matches, learned, step, step.speed(self._height, seconds))
+        self._learn(tracks, matches, learned, step)
         return step.motion
 
-    def _learn(
-        self, tracks: Tracks, matches: Matches, learned: FloatArray, step: Step, speed: float
-    ) -> None:
+    def _learn(self, tracks: Tracks, matches: Matches, learned: FloatArray, step: Step) -> None:
         """Learn from a trusted step how the camera moves, and the error of learned depth."""
         two_view = step.two_view
         still = two_view.inliers
@@ -301,6 +297,7 @@ class VisualOdometry:
         if min(len(above), len(below)) >= _MIN_RATIOS:
             self.below_is_nearer.append(bool(np.median(below) > np.median(above)))
         sigma = two_view.noise_px / self._intrinsics.fx * per_ray
+        speed = step.speed(self._height)
         self._history = self._history.with_step(two_view.unit_pose, step.inlier_ratio, speed)
         length = step.motion.length_unscaled
         self.depth_error = self.depth_error.with_step(learned[still], nearness, sigma, length)
@@ -449,32 +446,29 @@ class Step:
         """Share of the corners that fit."""
         return float(self.two_view.inliers.mean())
 
-    def speed(self, height_unscaled: float | None, seconds: float) -> float:
+    def speed(self, height_unscaled: float | None) -> float:
         """Camera heights a second, NaN where the height is unknown."""
-        if height_unscaled is None or seconds <= 0:
+        if height_unscaled is None or self.motion.seconds <= 0:
             return np.nan
-        return self.motion.length_unscaled / height_unscaled / seconds
+        return self.motion.length_unscaled / height_unscaled / self.motion.seconds
 
 
 def is_credible(
-    step: Step,
-    matches: Matches,
-    height_unscaled: float | None,
-    seconds: float,
-    history: MotionHistory,
+    step: Step, matches: Matches, height_unscaled: float | None, history: MotionHistory
 ) -> bool:
-    """Whether at least as many votes are for a step as against it.
+    """Whether a step has the speed and the inliers of those before, or as many votes for it as against it.
 
     Args:
         step: an estimate.
         matches: corners in both images.
         height_unscaled: of the camera above the road, in the unit of learned depth; None if
             unknown.
-        seconds: between both frames.
         history: of the steps before.
     """
-    speed = step.speed(height_unscaled, seconds)
-    is_possible = history.is_possible_speed(speed, seconds)
+    speed = step.speed(height_unscaled)
+    is_possible = history.is_possible_speed(speed, step.motion.seconds)
+    if is_possible is not False and not history.is_sudden_loss(step.inlier_ratio):
+        return True
     votes = [] if is_possible is None else [is_possible]
     # points of this step and the one before have the ratio of lengths that learned depth has
     if (

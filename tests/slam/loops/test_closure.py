@@ -260,7 +260,7 @@ def drive(places: int, again: int) -> list[View]:
 def apart(path: np.ndarray) -> Apart:
     """Thirty frames and fifteen metres."""
     frames = np.arange(len(path))
-    return lambda rows: (frames[rows, None] - frames >= 30) & (path[rows, None] - path >= 15.0)
+    return lambda row: (frames[row] - frames >= 30) & (path[row] - path >= 15.0)
 
 
 def test_revisited_places_are_found():

@@ -50,8 +50,8 @@ class Relocaliser:
         if not located:
             return None
         best = max(located, key=lambda seen: len(seen.inliers))
-        seen = self._intrinsics.project(apply(best.T_camera_points, points))
-        residual = np.linalg.norm(seen - pixels, axis=1)
+        projected = self._intrinsics.project(apply(best.T_camera_points, points))
+        residual = np.linalg.norm(projected - pixels, axis=1)
         kept = np.flatnonzero(residual < OF_KEYFRAMES.reprojection_px)
         for once in (rows, tracks):  # each corner and each point
             kept = kept[np.unique(once[kept], return_index=True)[1]]

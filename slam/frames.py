@@ -67,8 +67,9 @@ class Intrinsics(Pinhole):
         return np.stack([x, y, np.ones_like(x)], axis=-1)
 
     def project(self, points_camera: FloatArray) -> FloatArray:
-        """Pixels ``(..., 2)`` of points ``(..., 3)`` before the camera."""
+        """Pixels ``(..., 2)`` of points ``(..., 3)``, NaN for those behind the camera."""
         x, y, z = np.moveaxis(points_camera, -1, 0)
+        z = np.where(z > 0, z, np.nan)
         return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
 
     def pixel_grid(self) -> FloatArray:

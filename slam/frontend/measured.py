@@ -91,7 +91,7 @@ class Measured:
         snippets: by the pose network.
         motions: all steps that image geometry measured.
         road_steps: lengths of steps by the road's homography.
-        relative_rotations: rotations across several steps.
+        relative_rotations: rotations across two steps, by their three frames.
         failures: steps that image geometry could not measure, with the share of corners that were
             found again.
         roads: of every frame, the camera's height over the ground plane, None where it was not seen.
@@ -114,7 +114,7 @@ class Measured:
     snippets: list[SnippetPoses] = field(default_factory=list)
     motions: list[Motion] = field(default_factory=list)
     road_steps: dict[Ends, RoadStep] = field(default_factory=dict)
-    relative_rotations: dict[Ends, RelativeRotation] = field(default_factory=dict)
+    relative_rotations: dict[tuple[int, int, int], RelativeRotation] = field(default_factory=dict)
     failures: dict[Ends, float] = field(default_factory=dict)
     roads: list[float | None] = field(default_factory=list)
     views: list[View] = field(default_factory=list)
@@ -174,10 +174,10 @@ class Measured:
             """The items that begin in the window, of items in order of time that may span a few frames."""
             return list(takewhile(lambda item: start(item) >= first, reversed(items)))[::-1]
 
-        def within(items: dict[Ends, T]) -> dict[Ends, T]:
-            """The same of what was measured between two frames, which are renumbered."""
-            kept = last(items, lambda ends: ends[0])
-            return {(ends[0] - first, ends[1] - first): items[ends] for ends in kept}
+        def within(items: dict[Any, T]) -> dict[Any, T]:
+            """The same of what was measured between some frames, which are renumbered."""
+            kept = last(items, lambda frames: frames[0])
+            return {tuple(k - first for k in frames): items[frames] for frames in kept}
 
         window = Measured(
             road_steps=within(self.road_steps),

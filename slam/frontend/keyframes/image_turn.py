@@ -164,9 +164,8 @@ def _local_contrast(image: SmallImage, sigma: float) -> SmallImage:
 def turned(pixels: Pixels | FloatArray, R_now_before: FloatArray, intrinsics: Intrinsics) -> Pixels:
     """Where pixels ``(M, 2)`` of the last image are after a turn; those behind the camera stay."""
     rays = intrinsics.rays(pixels.astype(np.float64)) @ R_now_before.T
-    ahead = rays[:, 2] > 0.1
-    rays[~ahead, 2] = 1.0
-    return np.where(ahead[:, None], intrinsics.project(rays), pixels).astype(np.float32)
+    ahead = rays[:, 2:] > 0.1
+    return np.where(ahead, intrinsics.project(rays), pixels).astype(np.float32)
 
 
 def in_middle_row(pixels: _Places, turn: FloatArray, intrinsics: Intrinsics) -> _Places:

@@ -342,11 +342,9 @@ class LocalMap:
         for keyframe in self._near(T_camera_world, track_ids):
             rows = np.flatnonzero(attempts[keyframe.track_ids])
             X = apply(T_camera_world, self.points[keyframe.track_ids[rows]])
-            ahead = X[:, 2] > 0
-            X[~ahead, 2] = 1.0
             projected = intrinsics.project(X).astype(np.float32)
             limit = [intrinsics.width - _BORDER_PX, intrinsics.height - _BORDER_PX]
-            inside = ahead & ((projected > _BORDER_PX) & (projected < limit)).all(axis=1)
+            inside = ((projected > _BORDER_PX) & (projected < limit)).all(axis=1)
             rows, projected = rows[inside], projected[inside]
             if len(rows) < _LEAST_MATCHED:
                 continue

@@ -50,11 +50,9 @@ class Relocaliser:
         if not located:
             return None
         best = max(located, key=lambda seen: len(seen.inliers))
-        X = apply(best.T_camera_points, points)
-        ahead = X[:, 2] > 0
-        X[~ahead, 2] = 1.0
-        residual = np.linalg.norm(self._intrinsics.project(X) - pixels, axis=1)
-        kept = np.flatnonzero(ahead & (residual < OF_KEYFRAMES.reprojection_px))
+        projected = self._intrinsics.project(apply(best.T_camera_points, points))
+        residual = np.linalg.norm(projected - pixels, axis=1)
+        kept = np.flatnonzero(residual < OF_KEYFRAMES.reprojection_px)
         for once in (rows, tracks):  # each corner and each point
             kept = kept[np.unique(once[kept], return_index=True)[1]]
         if len(kept) < _LEAST_CONFIRMING:

@@ -87,7 +87,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class RelativeRotation:
-    """The rotation from one frame to another some steps later, measured on these two images alone.
+    """The rotation from one frame to another two steps later, measured on these two images alone.
 
     ``R_to_from`` ``(3, 3)`` takes points of the earlier camera to the axes of the later one;
     ``sigmas`` ``(3,)`` are those of its rotation vector in the later camera, radians.
@@ -123,28 +123,11 @@ def triangulated(steps: Steps) -> dict[Ends, Motion]:
     return {ends: motion for ends, motion in steps.items() if motion.is_triangulated}
 
 
-def shortest_by_start(steps: Iterable[Ends]) -> dict[int, Ends]:
-    """The shortest step from each frame, by that frame."""
-    shortest: dict[int, Ends] = {}
-    for ends in sorted(steps):
-        shortest.setdefault(ends[0], ends)
-    return shortest
-
-
-def path_between(by_start: Mapping[int, Ends], first: int, last: int) -> list[Ends] | None:
-    """Consecutive steps from a frame to a later one; None where one is missing."""
-    path: list[Ends] = []
-    while first < last:
-        if first not in by_start:
-            return None
-        path.append(by_start[first])
-        first = path[-1][1]
-    return path if first == last else None
-
-
 def links(steps: Iterable[Ends], frames: int) -> list[Ends]:
     """Consecutive steps from frame 0 to the last one; from a frame without a step, to the next frame."""
-    by_start = shortest_by_start(steps)
+    by_start: dict[int, Ends] = {}
+    for ends in sorted(steps):  # the shortest step from each frame
+        by_start.setdefault(ends[0], ends)
     found: list[Ends] = []
     frame = 0
     while frame < frames - 1:

@@ -14,7 +14,7 @@ from slam.frames import DepthMap, Ends, Frame, Intrinsics
 from slam.frontend.measured import Measured
 from slam.frontend.road import RoadHomography, RoadStep
 from slam.frontend.tracking import LONGEST_STEP, ROTATION_BASELINE
-from slam.frontend.visual.motion import Motion, path_between, shortest_by_start
+from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import PNP_SOURCE, VisualOdometry
 from slam.geometry.se3 import FloatArray, chain, invert, is_se3
 from slam.runtime.errors import Failed
@@ -115,20 +115,19 @@ class StepTracker:
         return first, wide
 
     def _rotation(self, recent: Sequence[Frame], current: Frame) -> list[Beside]:
-        """The rotation across the last steps, where all of them were triangulated."""
+        """The rotation across the last two steps, where both were triangulated."""
         if len(recent) < ROTATION_BASELINE:
             return []
-        first = recent[-ROTATION_BASELINE]
+        first, previous = recent[-ROTATION_BASELINE:]
+        frames = first.index, previous.index, current.index
         last = self._measured.motions[-2 * ROTATION_BASELINE :]
-        motions = {motion.ends: motion for motion in last if motion.is_triangulated}
-        path = path_between(shortest_by_start(motions), first.index, current.index)
-        if path is None or len(path) != ROTATION_BASELINE:
+        poses = {m.ends: m.relative_pose.T_from_to for m in last if m.is_triangulated}
+        if not poses.keys() >= {frames[:2], frames[1:]}:
             return []
-        T_previous_next = np.array([motions[ends].relative_pose.T_from_to for ends in path])
-        T_first_current = chain(T_previous_next)[-1]
+        T_first_current = chain(np.array([poses[frames[:2]], poses[frames[1:]]]))[-1]
         depth = self._seen(first)[1]
         rotation = self.odometry.relative_rotation(first, current, depth, T_first_current)
-        keep = partial(self._measured.relative_rotations.__setitem__, (first.index, current.index))
+        keep = partial(self._measured.relative_rotations.__setitem__, frames)
         return [("geometry", rotation, keep)]
 
     def _keep_road(self, ends: Ends, step: RoadStep | Failed) -> None:

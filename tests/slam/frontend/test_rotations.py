@@ -1,4 +1,4 @@
-"""Rotations of steps corrected by relative rotations across several of them."""
+"""Rotations of steps corrected by relative rotations across two of them."""
 
 from __future__ import annotations
 
@@ -65,14 +65,14 @@ def error_deg(table: Steps, truth: list[FloatArray]) -> float:
 
 def drive(
     bias: FloatArray, baseline_noise: float, seed: int = 0
-) -> tuple[Steps, dict[Ends, RelativeRotation], list[FloatArray]]:
+) -> tuple[Steps, dict[tuple[int, ...], RelativeRotation], list[FloatArray]]:
     """Steps with a rotation error of ``bias`` each, and rotations across two steps with the same error."""
     rng = np.random.default_rng(seed)
     truth, off = true_rotations(rng), Rotation.from_rotvec(bias).as_matrix()
     sigmas = np.full(3, SIGMA)
     steps = single([off @ small(rng, 0.1 * SIGMA) @ R for R in truth])
     across = {
-        (k, k + 2): RelativeRotation(
+        (k, k + 1, k + 2): RelativeRotation(
             off @ small(rng, baseline_noise) @ truth[k + 1] @ truth[k], sigmas
         )
         for k in range(ROTATIONS - 1)
@@ -89,8 +89,8 @@ def test_a_bias_of_every_measurement_counts_half_as_often_over_two_steps(axis: i
 def test_a_relative_rotation_that_is_far_off_is_an_outlier():
     steps, across, truth = drive(np.zeros(3), 0.1 * SIGMA)
     before = error_deg(smooth_rotations(steps, across), truth)
-    wrong = Rotation.from_euler("y", 5.0, degrees=True).as_matrix() @ across[10, 12].R_to_from
-    across[10, 12] = RelativeRotation(wrong, across[10, 12].sigmas)
+    wrong = Rotation.from_euler("y", 5.0, degrees=True).as_matrix() @ across[10, 11, 12].R_to_from
+    across[10, 11, 12] = RelativeRotation(wrong, across[10, 11, 12].sigmas)
     assert error_deg(smooth_rotations(steps, across), truth) < before + 0.02
 
 
@@ -127,9 +127,9 @@ def test_steps_that_skip_frames_are_smoothed_like_others():
     steps, across, truth = drive(np.array([SIGMA, 0.0, 0.0]), 0.1 * SIGMA)
     expected = rotations_of(smooth_rotations(steps, across))
     sparse = table_of({(3 * k, 3 * k + 3): R for (k, _), R in rotations_of(steps).items()})
-    sparse_across = {(3 * first, 3 * last): each for (first, last), each in across.items()}
+    sparse_across = {tuple(3 * k for k in frames): each for frames, each in across.items()}
     for (first, _), R in rotations_of(smooth_rotations(sparse, sparse_across)).items():
         np.testing.assert_allclose(R, expected[first // 3, first // 3 + 1], atol=1e-12)
     inside = RelativeRotation(truth[0], np.full(3, SIGMA))
-    ends_inside = {(k, k + 4): inside for k in range(0, 60, 3)}
+    ends_inside = {(k, k + 2, k + 4): inside for k in range(0, 60, 3)}
     assert smooth_rotations(sparse, ends_inside) is sparse

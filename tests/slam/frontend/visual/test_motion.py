@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from slam.frames import Ends, RelativePose
-from slam.frontend.visual.motion import Motion, links, path_between, pose_sigmas, shortest_by_start
+from slam.frontend.visual.motion import Motion, links, pose_sigmas
 from slam.geometry import se3
 
 NO_NOISE = np.zeros(6)
@@ -53,27 +53,6 @@ def test_no_sigma_of_a_translation_is_zero():
     ahead = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 2.0]))
     sigmas = pose_sigmas(ahead, np.concatenate([ROTATION_SIGMAS, [0.004, 0.0, 0.0]]), 0.05)
     np.testing.assert_allclose(sigmas, [*ROTATION_SIGMAS, 0.008, 0.002, 0.1])
-
-
-@pytest.mark.parametrize(
-    ("first", "last", "path"),
-    [
-        (0, 1, [(0, 1)]),
-        (0, 6, [(0, 1), (1, 4), (4, 6)]),
-        (1, 4, [(1, 4)]),
-        (1, 6, [(1, 4), (4, 6)]),
-        (4, 4, []),
-        (0, 3, None),  # inside of a step
-        (2, 4, None),  # no step begins there
-        (1, 5, None),  # the last step leads further
-        (4, 7, None),  # nothing leads on
-    ],
-)
-def test_a_path_is_made_of_steps_that_follow_each_other(
-    first: int, last: int, path: list[Ends] | None
-):
-    by_start = shortest_by_start([(0, 1), (1, 4), (4, 6), (0, 4)])
-    assert path_between(by_start, first, last) == path
 
 
 @pytest.mark.parametrize(

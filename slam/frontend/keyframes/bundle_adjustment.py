@@ -91,21 +91,14 @@ class BundleAdjustment:
         self._learned = np.isfinite(self._log_depth)
         self._log_depth[~self._learned] = 0.0
         # images of one point share the network's error
-        times = np.bincount(
-            sightings.point[self._learned], minlength=int(sightings.point.max(initial=-1)) + 1
-        )
+        self._points = int(sightings.point.max(initial=-1)) + 1
+        times = np.bincount(sightings.point[self._learned], minlength=self._points)
         self._depth_sigma = sightings.depth_sigma * np.sqrt(np.maximum(times[sightings.point], 1))
         self._column = np.where(free, np.cumsum(free) - 1, -1)
         self._free = free
-        self._points = int(sightings.point.max()) + 1 if len(sightings) else 0
         ends = np.searchsorted(sightings.camera, np.arange(len(free) + 1))
-        self._rows: list[slice] = []
-        self._learned_rows: list[NDArray[np.intp]] = []
-        for first, last in pairwise(ends.tolist()):
-            self._rows.append(slice(first, last))
-            learned = first + np.flatnonzero(self._learned[first:last])
-            if len(learned):
-                self._learned_rows.append(learned)
+        self._rows = [slice(*each) for each in pairwise(ends.tolist())]
+        _, self._image = np.unique(sightings.camera[self._learned], return_inverse=True)
         self._blocks = self._eliminated_together()
 
     def solve(
@@ -170,20 +163,15 @@ class BundleAdjustment:
         It is where an adjustment of the images' units would end, so that derivatives need not know
         it.
         """
-        whitened = np.zeros(len(logarithms))
-        if not self._learned_rows:
-            return whitened
-        rows = np.concatenate(self._learned_rows)
-        image = np.repeat(
-            np.arange(len(self._learned_rows)), [len(each) for each in self._learned_rows]
-        )
-        own, sigma = logarithms[rows], self._depth_sigma[rows]
-        near, full = self._robust * sigma, sigma**-2
-        unit = np.array([median(logarithms[each]) for each in self._learned_rows])
+        own, sigma = logarithms[self._learned], self._depth_sigma[self._learned]
+        image, near, full = self._image, self._robust * sigma, sigma**-2
+        parts = np.split(own, np.flatnonzero(np.diff(image)) + 1)  # image by image
+        unit = np.array([median(part) for part in parts])
         for _ in range(_ROUNDS):
             weight = full * np.minimum(1.0, near / np.maximum(np.abs(own - unit[image]), 1e-9))
             unit = np.bincount(image, weight * own) / np.bincount(image, weight)
-        whitened[rows] = (own - unit[image]) / sigma
+        whitened = np.zeros(len(logarithms))
+        whitened[self._learned] = (own - unit[image]) / sigma
         return whitened
 
     def jacobians(

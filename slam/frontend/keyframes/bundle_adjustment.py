@@ -7,14 +7,15 @@ perturbed on the left, ``Exp(xi) T_camera_world``, rotation first.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import compress, pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.sparse import csc_array
+from scipy.sparse import bsr_array
 from scipy.sparse.linalg import splu
 
 from slam.frames import Intrinsics
@@ -25,13 +26,9 @@ from slam.geometry.se3 import FloatArray, apply, compose, from_rotation_vector
 _ROBUST = 1.5  # sigmas beyond which residuals weigh less
 _FIRST_DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6
-# points whose sightings are eliminated together: they share few cameras
-_BLOCK = 512
 _ROUNDS = 5  # of Huber's location
-_MOST_DENSE = 150  # cameras: each of more shares points with few others only
-_SIX = np.arange(6)
+_MOST_DENSE = 900  # unknowns of 150 cameras: each of more shares points with few others only
 
-Part = tuple[NDArray[np.int64], FloatArray]
 _StepByDamping = Callable[[float], tuple[FloatArray, FloatArray] | None]
 
 
@@ -94,12 +91,13 @@ class BundleAdjustment:
         self._points = int(sightings.point.max(initial=-1)) + 1
         times = np.bincount(sightings.point[self._learned], minlength=self._points)
         self._depth_sigma = sightings.depth_sigma * np.sqrt(np.maximum(times[sightings.point], 1))
-        self._column = np.where(free, np.cumsum(free) - 1, -1)
         self._free = free
         ends = np.searchsorted(sightings.camera, np.arange(len(free) + 1))
         self._rows = [slice(*each) for each in pairwise(ends.tolist())]
         _, self._image = np.unique(sightings.camera[self._learned], return_inverse=True)
-        self._blocks = self._eliminated_together()
+        # sightings by free cameras, and where those of each begin among them
+        self._of_free = np.flatnonzero(free[sightings.camera])
+        self._begins = np.concatenate([[0], np.cumsum(np.diff(ends)[free])])
 
     def solve(
         self,
@@ -235,78 +233,27 @@ class BundleAdjustment:
             for j in range(i + 1):
                 V[:, i, j] = V[:, j, i] = np.bincount(point, (B[i] * B[j]).sum(axis=0), points)
         W = A[:, None, 0] * B[:, 0] + A[:, None, 1] * B[:, 1] + A[:, None, 2] * B[:, 2]
+        blocks = W[..., self._of_free].transpose(2, 0, 1)
+        coupling = bsr_array((blocks, point[self._of_free], self._begins), (6 * len(U), 3 * points))
+        of_cameras, of_points = camera_side.ravel(), point_side.ravel()
 
         def step(damping: float) -> tuple[FloatArray, FloatArray] | None:
-            V_inverse = np.asarray(np.linalg.inv(_damped(V, damping)), np.float64)
-            # the cameras' system without the points, as a sum of parts
-            side, by_point = camera_side.copy(), point_side.copy()
-            parts = [(np.array([k]), own) for k, own in enumerate(_damped(U, damping))]
-            coupled = []
-            for block in self._blocks:
-                coupling = W[..., block.sightings]
-                inverse = np.ascontiguousarray(
-                    V_inverse[block.points[block.local_point]].transpose(1, 2, 0)
-                )
-                # row by row: products of small matrices one by one take ten times as long
-                with_points = sum(coupling[:, i, None] * inverse[i] for i in range(3))
-                W_block = block.dense(coupling)
-                WV = block.dense(with_points)
-                # cameras of a block are few, so that the product is small
-                parts.append((block.cameras, -(WV @ W_block.T)))
-                side[block.cameras] -= (WV @ point_side[block.points].ravel()).reshape(-1, 6)
-                coupled.append((block, W_block))
-            by_camera = solve_sum(parts, side)
+            V_inverse = _diagonal(np.linalg.inv(_damped(V, damping)))
+            with_points = coupling @ V_inverse
+            # the cameras' system without the points
+            system = _diagonal(_damped(U, damping)) - with_points @ coupling.T
+            by_camera = _solved(system, of_cameras - with_points @ of_points)
             if by_camera is None:
                 return None
-            for block, W_block in coupled:
-                by_point[block.points] -= (by_camera[block.cameras].ravel() @ W_block).reshape(
-                    -1, 3
-                )
-            return by_camera, np.einsum("pij,pj->pi", V_inverse, by_point)
+            by_point = V_inverse @ (of_points - coupling.T @ by_camera)
+            return by_camera.reshape(-1, 6), by_point.reshape(-1, 3)
 
         return step
 
-    def _eliminated_together(self) -> list[_Block]:
-        """Points in the order of the first camera that sees them, in blocks that share few cameras."""
-        camera, point = self._column[self._seen.camera], self._seen.point
-        rows = np.flatnonzero(camera >= 0)
-        first = np.full(self._points, np.iinfo(np.int64).max)
-        np.minimum.at(first, point[rows], camera[rows])
-        order = np.argsort(first, kind="stable")
-        place = np.empty(self._points, np.int64)
-        place[order] = np.arange(self._points)
-        blocks = []
-        by_place = rows[np.argsort(place[point[rows]], kind="stable")]
-        starts = np.searchsorted(
-            place[point[by_place]], np.arange(0, self._points + _BLOCK, _BLOCK)
-        )
-        for n, (start, end) in enumerate(pairwise(starts)):
-            if start == end:
-                continue
-            sightings = by_place[start:end]
-            cameras, local = np.unique(camera[sightings], return_inverse=True)
-            points = order[n * _BLOCK : (n + 1) * _BLOCK]
-            blocks.append(
-                _Block(sightings, cameras, local, points, place[point[sightings]] - n * _BLOCK)
-            )
-        return blocks
 
-
-@dataclass(frozen=True)
-class _Block:
-    """Sightings of some points: rows, the ``cameras`` (columns) and ``points`` among them, and their local numbers."""
-
-    sightings: NDArray[np.int64]
-    cameras: NDArray[np.int64]
-    local_camera: NDArray[np.int64]
-    points: NDArray[np.int64]
-    local_point: NDArray[np.int64]
-
-    def dense(self, coupling: FloatArray) -> FloatArray:
-        """The matrix of all cameras and points, from the ``(6, 3, s)`` block of each sighting."""
-        matrix = np.zeros((len(self.cameras), 6, len(self.points), 3))
-        matrix[self.local_camera, :, self.local_point, :] = coupling.transpose(2, 0, 1)
-        return matrix.reshape(6 * len(self.cameras), 3 * len(self.points))
+def _diagonal(blocks: NDArray[np.floating[Any]]) -> bsr_array:
+    """The matrix with square blocks ``(B, n, n)`` along its diagonal."""
+    return bsr_array((blocks, np.arange(len(blocks)), np.arange(len(blocks) + 1)))
 
 
 def _damped(blocks: FloatArray, damping: float) -> FloatArray:
@@ -315,40 +262,19 @@ def _damped(blocks: FloatArray, damping: float) -> FloatArray:
     return blocks + added[:, :, None] * np.eye(blocks.shape[1])
 
 
-def solve_sum(parts: Sequence[Part], side: FloatArray) -> FloatArray | None:
-    """The solution of the sum of symmetric parts, positive definite.
-
-    Args:
-        parts: different cameras ``(c,)`` each, and what couples their unknowns ``(6c, 6c)``.
-        side: the right side ``(F, 6)``.
-
-    Returns:
-        ``(F, 6)``, or None where the sum is singular.
-    """
-    unknowns = [(6 * cameras[:, None] + _SIX).ravel() for cameras, _ in parts]
-    right = side.ravel()
+def _solved(system: bsr_array, side: FloatArray) -> FloatArray | None:
+    """The solution of a symmetric system, positive definite; None where it is singular."""
     try:
         if len(side) <= _MOST_DENSE:
-            S = np.zeros((len(right), len(right)))
-            for rows, (_, part) in zip(unknowns, parts, strict=True):
-                S[np.ix_(rows, rows)] += part
-            return np.asarray(
-                cho_solve(cho_factor(S, check_finite=False), right, check_finite=False)
-            ).reshape(-1, 6)
-        entries, of_rows, of_columns = [], [], []
-        for rows, (_, part) in zip(unknowns, parts, strict=True):
-            entries.append(part.ravel())
-            of_rows.append(np.repeat(rows, len(rows)))
-            of_columns.append(np.tile(rows, len(rows)))
-        places = np.concatenate(of_rows), np.concatenate(of_columns)
-        system = csc_array((np.concatenate(entries), places), shape=(len(right), len(right)))
+            factor = cho_factor(system.toarray(), check_finite=False)
+            return np.asarray(cho_solve(factor, side, check_finite=False))
         # as a symmetric one: its pattern decides the order, and pivots stay on the diagonal
         factors = splu(
-            system,
+            system.tocsc(),
             permc_spec="MMD_AT_PLUS_A",
             diag_pivot_thresh=0.0,
             options={"SymmetricMode": True},
         )
     except (LinAlgError, RuntimeError):
         return None
-    return np.asarray(factors.solve(right)).reshape(-1, 6)
+    return np.asarray(factors.solve(side))

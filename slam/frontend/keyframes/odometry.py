@@ -57,10 +57,12 @@ logger = logging.getLogger(__name__)
 _SLIPPED = 8.0 / 3.0
 _MOST_FLOW = 4.0
 _LEAST_SHIFT_PX = 16.0  # smaller ones flow finds by itself
-# of turned images, for a guess, and for a measurement
+# of turned images, for a guess, for a measurement, and where they show a turn and hardly more
 _LEAST_CORRELATION = 0.4
 _SURE_CORRELATION = 0.82
-_KEYFRAME_TRACKS_RATIO = 0.25  # ratio of a keyframe's corners still tracked that asks for another
+_CLEAR_CORRELATION = 0.9
+# ratio of a keyframe's corners still tracked that asks for another, and in a turn for dense flow
+_KEYFRAME_TRACKS_RATIO, _FLOW_TRACKS_RATIO = 0.25, 0.35
 # seconds without a pose after which a new map is begun, the next frame's included
 _MAX_LOST_S = 0.35
 _LAST_FRAMES = 4  # frames in which a pose is looked up
@@ -180,15 +182,23 @@ class KeyframeOdometry:
             self._turn_rate = measured_turn(
                 last.pixels[a], pixels[b], since, self._turn_rate, self._intrinsics
             )
-        if self._locate(segment, frame, track_ids, pixels):
+        keyframe = segment.keyframes[-1]
+        are_few = len(track_ids) < _FLOW_TRACKS_RATIO * len(keyframe.track_ids)
+        if turn is None and are_few:
+            turn = image_turn(*images)
+        # what flow of corners still finds then has mostly slipped
+        turns = are_few and turn is not None and turn.correlation > _CLEAR_CORRELATION
+        if not turns and self._locate(segment, frame, track_ids, pixels):
             return
         turn = image_turn(*images) if turn is None else turn
         self._T_last_step = make(turn.R_now_before, np.zeros(3))
         T_turned = compose(self._T_last_step, self._T_camera_world)
         image = NewImage(frame.grey, T_turned, self._intrinsics)
-        track_ids, pixels = image.flowed(segment.keyframes[-1])
-        seen = ~frame.is_fixed(pixels)
-        if self._locate(segment, frame, track_ids[seen], pixels[seen], is_doubtful=True):
+        flowed_ids, flowed = image.flowed(keyframe)
+        lost = ~np.isin(flowed_ids, track_ids) & ~frame.is_fixed(flowed)
+        track_ids = np.concatenate([track_ids, flowed_ids[lost]])
+        pixels = np.concatenate([pixels, flowed[lost]])
+        if self._locate(segment, frame, track_ids, pixels, is_doubtful=True):
             return
         if turn.correlation > _SURE_CORRELATION and not self._lost:
             self._T_camera_world = T_turned

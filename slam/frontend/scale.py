@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple
 
@@ -146,19 +146,6 @@ class Scale:
     def unit_name(self) -> str | None:
         """``m``, with mode none ``unit``; None where metres were not found."""
         return "m" if self.is_metric else self.unit if self.mode == "none" else None
-
-    def in_metres(self, other: ScaleEstimate | Failed) -> Scale:
-        """In metres, by those per unit of this scale; where they were not found the unit stays."""
-        if isinstance(other, Failed):
-            logger.warning("no scale (%s): lengths stay in %s", other.reason, self.unit)
-            return replace(self, estimate=other)
-        per_frame = other.value * self.per_frame
-        estimate = replace(other, value=median(per_frame))
-        lengths = {
-            ends: length._replace(value=other.value * length.value)
-            for ends, length in self.lengths.items()
-        }
-        return replace(self, estimate=estimate, per_frame=per_frame, lengths=lengths, unit="metres")
 
     def scaled(self, measured: RelativePose) -> RelativePose:
         """An unscaled measurement in the mode's unit at its first frame."""

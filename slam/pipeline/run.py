@@ -32,6 +32,7 @@ from slam.frontend.measured import Measured
 from slam.frontend.network_motion import chain_raw
 from slam.frontend.scale import Scale, ScaleEstimate, find_scale, height_by_lidar
 from slam.frontend.scale_mode import require_scans, unit_of
+from slam.geometry.robust import median
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures, close_loops
@@ -157,13 +158,8 @@ class SlamPipeline:
         lidar_steps, agreements = self._compared(drive, lidar)
         with self._watch.stage("scale"):
             scale = find_scale(self.unit, drive, lidar_steps)
-        factors = make_factors(drive, scale)
-        if self.unit.metres is not None:
-            metres = self.unit.metres(chain_odometry(factors, len(drive)))
-            agreements += self._height_by(metres, scale)
-            scale = scale.in_metres(metres)
-            if isinstance(metres, ScaleEstimate):
-                factors = [factor.scaled(metres.value) for factor in factors]
+        scale, factors, by_height = self._in_metres(scale, make_factors(drive, scale))
+        agreements += by_height
         if self._config.lidar.factors and scale.is_metric:
             factors += lidar_steps
         T_odometry = chain_odometry(factors, len(drive))
@@ -307,17 +303,36 @@ class SlamPipeline:
             return MapClosure(poses, LoopClosures(not_sought=closed.reason))
         return closed
 
-    def _height_by(self, metres: ScaleEstimate | Failed, scale: Scale) -> list[Agreement]:
-        """How the camera's height in metres agrees with the stated one, where the road is seen.
+    def _in_metres(
+        self, scale: Scale, factors: list[RelativePose]
+    ) -> tuple[Scale, list[RelativePose], list[Agreement]]:
+        """Scale and factors in the metres that the mode knows of the odometry; else in the unit that they have.
+
+        Also how the camera's height in metres agrees with the stated one, where the road is seen.
 
         Raises:
             SlamError: it contradicts it.
         """
-        if isinstance(metres, Failed) or isinstance(scale.estimate, Failed):
-            return []
-        source, stated_m = f"scale.mode={self.unit.mode}", self.sequence.camera_height_m
-        by_unit = agreement.of_height(source, metres.value, stated_m, scale.estimate.spread)
-        return [by_unit.required()]
+        if self.unit.metres is None:
+            return scale, factors, []
+        metres = self.unit.metres(chain_odometry(factors, len(scale.per_frame)))
+        if isinstance(metres, Failed):
+            logger.warning("no scale (%s): lengths stay in %s", metres.reason, scale.unit)
+            return replace(scale, estimate=metres), factors, []
+        heights = []
+        if isinstance(scale.estimate, ScaleEstimate):
+            height = metres.value, self.sequence.camera_height_m, scale.estimate.spread
+            heights.append(agreement.of_height(f"scale.mode={self.unit.mode}", *height).required())
+        per_frame = metres.value * scale.per_frame
+        lengths = {
+            ends: length._replace(value=metres.value * length.value)
+            for ends, length in scale.lengths.items()
+        }
+        estimate = replace(metres, value=median(per_frame))
+        scale = replace(
+            scale, estimate=estimate, per_frame=per_frame, lengths=lengths, unit="metres"
+        )
+        return scale, [factor.scaled(metres.value) for factor in factors], heights
 
     def _loops(
         self,

@@ -460,7 +460,7 @@ def test_exact_fixes_give_scale_and_place():
     result = located(
         track(np.random.default_rng(0), 0.0), "gps.sigma_m=0.1", "gps.vertical_sigma_m=0.1"
     )
-    assert result.scale.mode == "gps" and worst(result) < 0.1
+    assert result.scale.mode == "gps" and result.scale.is_metric and worst(result) < 0.1
     location = result.location
     assert isinstance(location, Location)
     places = location.fixes.frame.places(
@@ -524,7 +524,7 @@ def test_a_camera_that_stands_is_not_located():
         GpsTrack(gps.stamps, np.tile(PLACE, (len(gps.stamps), 1)), gps.dilution, gps.speeds)
     )
     assert isinstance(result.location, Failed) and "moves too little" in result.location.reason
-    assert isinstance(result.scale.estimate, Failed)
+    assert isinstance(result.scale.estimate, Failed) and result.scale.unit == "camera heights"
 
 
 def test_fixes_in_metres_are_no_factors_of_lengths_that_are_not(caplog: pytest.LogCaptureFixture):

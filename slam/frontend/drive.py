@@ -12,7 +12,7 @@ import numpy as np
 from slam.frames import Ends, RelativePose, SnippetPoses, TrackingEvent, View, runs
 from slam.frontend.gaps import interpolate_gaps
 from slam.frontend.keyframes.relative_poses import NO_MAPS, KeyframePoses
-from slam.frontend.measured import FrontEnd, Keyframe, Measured, frame_support, named
+from slam.frontend.measured import FrontEnd, Keyframe, Measured, named
 from slam.frontend.road import RoadStep, with_slope
 from slam.frontend.rotations import smooth_rotations
 from slam.frontend.visual.motion import Motion, Steps, triangulated
@@ -104,8 +104,17 @@ class Drive:
 
     @property
     def support(self) -> FloatArray | None:
-        """`frame_support` of all frames ``(N,)``; None where maps of keyframes give the poses."""
-        return None if self.by_keyframes else frame_support(range(len(self)), self.steps.values())
+        """The share of the corners that fit the motion to each frame ``(N,)``, 0 without one; the first has the next's.
+
+        None where maps of keyframes give the poses.
+        """
+        if self.by_keyframes:
+            return None
+        support = np.zeros(len(self))
+        for (_, last), motion in self.steps.items():
+            support[last] = max(support[last], motion.support)
+        support[0] = support[1]
+        return support
 
     def parted(self, T_world_camera: FloatArray) -> Drive:
         """The drive with a new segment after each step of a trajectory ``(N, 4, 4)`` that no camera makes.

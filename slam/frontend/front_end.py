@@ -182,7 +182,9 @@ def _is_on_vehicle(measured: Measured) -> bool | None:
     None while they are few. Without a road nothing has the speed of a vehicle; a vehicle that starts is slow.
     """
     first = list(
-        islice((motion for motion in measured.motions if motion.is_triangulated), _MOST_STEPS)
+        islice(
+            (motion for motion in measured.steps.values() if motion.is_triangulated), _MOST_STEPS
+        )
     )
     if len(first) < _CLEAR_STEPS:
         return None

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Reversible, Sequence
+from collections.abc import Callable, Collection, Reversible, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from itertools import takewhile
+from itertools import islice, takewhile
 from typing import Any, TypeVar
 
 import numpy as np
@@ -27,7 +27,7 @@ from slam.frontend.followed_corners import CornerRecord, FollowedCorners
 from slam.frontend.keyframes.local_map import LocalMap
 from slam.frontend.road import RoadStep
 from slam.frontend.visual.depth_error import DepthError
-from slam.frontend.visual.motion import Motion, RelativeRotation, Steps
+from slam.frontend.visual.motion import Motion, RelativeRotation
 from slam.geometry.se3 import FloatArray
 from slam.runtime.memory import Spilled, SpillFile
 
@@ -89,7 +89,7 @@ class Measured:
 
     Attributes:
         snippets: by the pose network.
-        motions: all steps that image geometry measured.
+        steps: that image geometry measured.
         road_steps: lengths of steps by the road's homography.
         relative_rotations: rotations across two steps, by their three frames.
         failures: steps that image geometry could not measure, with the share of corners that were
@@ -112,7 +112,7 @@ class Measured:
     """
 
     snippets: list[SnippetPoses] = field(default_factory=list)
-    motions: list[Motion] = field(default_factory=list)
+    steps: dict[Ends, Motion] = field(default_factory=dict)
     road_steps: dict[Ends, RoadStep] = field(default_factory=dict)
     relative_rotations: dict[tuple[int, int, int], RelativeRotation] = field(default_factory=dict)
     failures: dict[Ends, float] = field(default_factory=dict)
@@ -146,16 +146,10 @@ class Measured:
             return False
         return sum(votes) < _UPSIDE_DOWN * len(votes)
 
-    @property
-    def steps(self) -> Steps:
-        """The steps of image geometry; a later one replaces an earlier one between the same frames."""
-        return {motion.ends: motion for motion in self.motions}
-
     def last_step(self, index: int) -> Motion | None:
         """The step to one of the last frames, where image geometry measured it."""
-        return next(
-            (motion for motion in self.motions[-LAST_STEPS:] if motion.ends[1] == index), None
-        )
+        last = islice(reversed(self.steps.values()), LAST_STEPS)
+        return next((motion for motion in last if motion.ends[1] == index), None)
 
     def copy(self) -> Measured:
         """A snapshot: what is measured later is added to one of both alone."""
@@ -192,20 +186,10 @@ class Measured:
             target = snippet.target - first
             sources = tuple(source - first for source in snippet.sources)
             window.snippets.append(replace(snippet, target=target, sources=sources))
-        for motion in last(self.motions, lambda motion: motion.ends[0]):
-            from_index, to_index = (k - first for k in motion.ends)
-            pose = replace(motion.relative_pose, from_index=from_index, to_index=to_index)
-            window.motions.append(replace(motion, relative_pose=pose))
+        for ends, motion in within(self.steps).items():
+            pose = replace(motion.relative_pose, from_index=ends[0], to_index=ends[1])
+            window.steps[ends] = replace(motion, relative_pose=pose)
         return window
-
-
-def frame_support(frames: range, motions: Iterable[Motion]) -> FloatArray:
-    """The share of the corners that fit the motion to each frame ``(N,)``, 0 without one; the first has the next's."""
-    found: dict[int, float] = {}
-    for motion in motions:
-        found[motion.ends[1]] = max(found.get(motion.ends[1], 0.0), motion.support)
-    found[0] = found.get(1, 0.0)
-    return np.array([found.get(frame, 0.0) for frame in frames])
 
 
 def named(frames: Collection[int]) -> str:

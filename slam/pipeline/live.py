@@ -19,7 +19,7 @@ from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image, Intrinsics, Predictor
 from slam.frontend.drive import Drive, complete_drive
 from slam.frontend.factors import chain_odometry, make_factors
-from slam.frontend.measured import LAST_STEPS, Measured, frame_support
+from slam.frontend.measured import Measured
 from slam.frontend.scale import Scale, Unit, find_scale
 from slam.geometry.se3 import FloatArray, apply, compose, in_unit, invert
 from slam.loops.closure import LoopClosures
@@ -92,12 +92,12 @@ class LivePoses:
         if measured.snippets and (self._unit is None or count // _UPDATE > first // _UPDATE):
             self._solve(observer, count)
         unit = None if self.unit_name is None else self._unit
-        support = frame_support(frames, measured.motions[-LAST_STEPS * len(frames) :]).tolist()
         poses: list[LivePose] = []
-        for index, pose, share in zip(frames, self._T_world_camera[first:], support):
-            state = self._state(index in measured.unusable)
-            support_of = None if index in unasked else share
-            poses.append(LivePose(index, pose.copy(), state, unit, support_of))
+        for index, pose in zip(frames, self._T_world_camera[first:]):
+            state, step = self._state(index in measured.unusable), measured.last_step(index)
+            share = 0.0 if step is None else step.support
+            support = None if index in unasked else share
+            poses.append(LivePose(index, pose.copy(), state, unit, support))
         return poses
 
     def correct(self, T_world_camera: FloatArray, scale: Scale) -> None:

@@ -75,7 +75,7 @@ class StepTracker:
             self._measured.failures[ends] = self.odometry.found
             logger.info("geometry %d -> %d failed: %s", *ends, step.reason)
             return []
-        self._measured.motions.append(step)
+        self._measured.steps[step.ends] = step
         if not step.is_triangulated:
             return []
         road = partial(self._road.measure, first[0], current, step.relative_pose.T_from_to)
@@ -97,7 +97,7 @@ class StepTracker:
         """
         first, T_first_previous, between = apart
         wide = step if first[0] is previous else self._motion(first, current)
-        motions, frames = self._measured.motions, current.index - first[0].index
+        frames = current.index - first[0].index
         if not isinstance(wide, Motion) or wide.support < _LEAST_SEEN or frames > LONGEST_STEP:
             return first, step
         if not wide.is_triangulated:
@@ -111,7 +111,7 @@ class StepTracker:
                 self._apart = first, pose.T_from_to, [*between, known]
                 return first, step
             self._apart, wide = (first, pose.T_from_to, []), known
-        motions[len(motions) - len(between) :] = between
+        self._measured.steps |= {each.ends: each for each in between}
         return first, wide
 
     def _rotation(self, recent: Sequence[Frame], current: Frame) -> list[Beside]:
@@ -120,11 +120,11 @@ class StepTracker:
             return []
         first, previous = recent[-ROTATION_BASELINE:]
         frames = first.index, previous.index, current.index
-        last = self._measured.motions[-2 * ROTATION_BASELINE :]
-        poses = {m.ends: m.relative_pose.T_from_to for m in last if m.is_triangulated}
-        if not poses.keys() >= {frames[:2], frames[1:]}:
+        steps = map(self._measured.steps.get, (frames[:2], frames[1:]))
+        poses = [m.relative_pose.T_from_to for m in steps if m is not None and m.is_triangulated]
+        if len(poses) < ROTATION_BASELINE:
             return []
-        T_first_current = chain(np.array([poses[frames[:2]], poses[frames[1:]]]))[-1]
+        T_first_current = chain(np.array(poses))[-1]
         depth = self._seen(first)[1]
         rotation = self.odometry.relative_rotation(first, current, depth, T_first_current)
         keep = partial(self._measured.relative_rotations.__setitem__, frames)

@@ -13,7 +13,7 @@ from slam.frames import Intrinsics, RelativePose
 from slam.frontend import agreement
 from slam.frontend.drive import Drive, Segment
 from slam.frontend.lidar_odometry import LidarPath, lidar_steps
-from slam.frontend.measured import Measured, frame_support
+from slam.frontend.measured import Measured
 from slam.frontend.self_calibration import FoundCamera
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.motion import Motion
@@ -194,5 +194,6 @@ def test_two_contradictions_are_two_warnings(monkeypatch, capsys):
 
 
 def test_a_frame_without_a_motion_has_no_support():
-    motions = [Motion(RelativePose(0, 1, STEPS[0], np.full(6, 0.01), "essential"), support=0.7)]
-    assert frame_support(range(3), motions).tolist() == [0.7, 0.7, 0.0]
+    pose = RelativePose(0, 1, STEPS[0], np.full(6, 0.01), "essential")
+    drive = Drive(Measured(roads=[None] * 3), {(0, 1): Motion(pose, support=0.7)})
+    assert drive.support is not None and drive.support.tolist() == [0.7, 0.7, 0.0]

@@ -37,14 +37,14 @@ KEYFRAMES_WITH_LOOPS = SlamConfig(
 def steps(count: int, scatter: float, seconds: float = 0.1) -> Measured:
     """Steps of a camera height each."""
     rng = np.random.default_rng(0)
-    motions = []
+    motions = {}
     for k in range(count):
         T = from_rotation_vector(
             np.zeros(3), np.array([0.0, 0.0, 1.0]) + rng.normal(0.0, scatter, 3)
         )
         pose = RelativePose(k, k + 1, T, np.ones(6), "essential")
-        motions.append(Motion(pose, np.eye(6), seconds=seconds))
-    return Measured(motions=motions, roads=[1.0] * count)
+        motions[pose.ends] = Motion(pose, np.eye(6), seconds=seconds)
+    return Measured(steps=motions, roads=[1.0] * count)
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ def test_steps_are_measured_where_keyframes_have_no_pose(stands: bool):
         drive = completed(observer)
     started = min(drive.map_poses.segments)
     assert started < 10 and len(drive.map_poses.segments) == 40 - len(blank) - started
-    late = [motion.ends for motion in observer.measured.motions if motion.ends[0] > 19]
+    late = [ends for ends in observer.measured.steps if ends[0] > 19]
     assert late == [(23, 26)]
     assert set(drive.interpolated) == {*blank, *(() if stands else repeated)}
 

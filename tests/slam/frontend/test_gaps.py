@@ -43,7 +43,8 @@ def closed(T_world_camera: FloatArray, unusable: set[int], *steps: Motion) -> Fi
 def collected(
     snippets: list[SnippetPoses], steps: Iterable[Motion] = (), **others: Any
 ) -> Measured:
-    return Measured(snippets=snippets, motions=list(steps), roads=[None] * COUNT, **others)
+    by_ends = {motion.ends: motion for motion in steps}
+    return Measured(snippets=snippets, steps=by_ends, roads=[None] * COUNT, **others)
 
 
 def test_a_drive_without_gaps_stays_as_it_was():

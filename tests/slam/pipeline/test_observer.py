@@ -297,8 +297,8 @@ def assert_same(one: Observer, other: Observer) -> None:
     assert first.road_steps.keys() == second.road_steps.keys()
     for measured in (
         lambda o: [rotation.R_to_from for rotation in o.relative_rotations.values()],
-        lambda o: [motion.relative_pose.T_from_to for motion in o.motions],
-        lambda o: [motion.relative_pose.sigmas for motion in o.motions],
+        lambda o: [motion.relative_pose.T_from_to for motion in o.steps.values()],
+        lambda o: [motion.relative_pose.sigmas for motion in o.steps.values()],
         lambda o: [snippet.T_source_target for snippet in o.snippets],
         lambda o: [road for road in o.roads if road is not None],
         lambda o: [step.length_heights for step in o.road_steps.values()],

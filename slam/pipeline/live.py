@@ -88,15 +88,13 @@ class LivePoses:
         measured = observer.measured
         first, count = len(self._T_world_camera), len(measured)
         frames = range(first, count)
-        unasked = {0, *(index for index in frames if self._step(observer, index))}
+        supports = [self._step(observer, index) for index in frames]
         if measured.snippets and (self._unit is None or count // _UPDATE > first // _UPDATE):
             self._solve(observer, count)
         unit = None if self.unit_name is None else self._unit
         poses: list[LivePose] = []
-        for index, pose in zip(frames, self._T_world_camera[first:]):
-            state, step = self._state(index in measured.unusable), measured.last_step(index)
-            share = 0.0 if step is None else step.support
-            support = None if index in unasked else share
+        for index, pose, support in zip(frames, self._T_world_camera[first:], supports):
+            state = self._state(index in measured.unusable)
             poses.append(LivePose(index, pose.copy(), state, unit, support))
         return poses
 
@@ -112,11 +110,11 @@ class LivePoses:
             return "starting"
         return "bridged" if is_bridged else "relocalised" if before else "tracking"
 
-    def _step(self, observer: Observer, index: int) -> bool:
-        """Append the pose of a frame by its own step, or by the last one again; whether a map has it."""
+    def _step(self, observer: Observer, index: int) -> float | None:
+        """Append the pose of a frame by its own step, or by the last one again; its support, as in a `LivePose`."""
         if not index:
             self._T_world_camera.append(np.eye(4))
-            return False
+            return None
         before, by_keyframes, motion = (
             index - 1,
             observer.tracker.pose(index),
@@ -135,7 +133,9 @@ class LivePoses:
                 invert(self._T_world_camera[max(before - 1, 0)]) @ self._T_world_camera[before]
             )
         self._T_world_camera.append(compose(self._T_world_camera[before], T_before_frame))
-        return by_keyframes is not None
+        if by_keyframes is not None:
+            return None
+        return 0.0 if motion is None else motion.support
 
     def _solve(self, observer: Observer, count: int) -> None:
         """Poses of the window by its own measurements, from its first one on, or from the last settled one on."""

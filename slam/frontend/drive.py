@@ -46,7 +46,7 @@ class Drive:
         steps: those of image geometry, their rotations smoothed; none between interpolated frames.
         road_steps: lengths by the road, with the camera's pitch by the path.
         snippets: of the pose network, one a target; missing ones are interpolated.
-        trusted: those that it measured on usable frames.
+        network_steps: ``T_k_next`` by k, unscaled, of the snippets that it measured on usable frames.
         interpolated: the frames of gaps, with the reason.
         gap_steps: the steps of gaps.
         segments: parts of the drive that no measurement relates.
@@ -58,7 +58,7 @@ class Drive:
     steps: Steps = field(default_factory=dict)
     road_steps: Mapping[Ends, RoadStep] = field(default_factory=dict)
     snippets: Sequence[SnippetPoses] = ()
-    trusted: Sequence[SnippetPoses] = ()
+    network_steps: Mapping[int, FloatArray] = field(default_factory=dict)
     interpolated: Mapping[int, str] = field(default_factory=dict)
     gap_steps: Sequence[RelativePose] = ()
     segments: Sequence[Segment] = ()
@@ -221,7 +221,7 @@ def complete_drive(
         smoothed,
         with_slope(measured.road_steps, smoothed),
         filled.snippets,
-        filled.trusted,
+        filled.network_steps,
         filled.interpolated,
         filled.gap_steps,
         find_segments(

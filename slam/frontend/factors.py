@@ -18,7 +18,6 @@ from slam.frontend.network_motion import (
     STUDENT_T_DOF,
     calibrate_network,
     network_factors,
-    network_steps,
 )
 from slam.frontend.scale import Scale
 from slam.frontend.visual.noise import step_noise
@@ -46,10 +45,11 @@ def make_factors(drive: Drive, scale: Scale, level: int = logging.INFO) -> list[
         else:  # its length is that by learned depth
             geometric.append(scale.scaled(motion.relative_pose))
     by_keyframes = [scale.scaled(pose) for pose in maps.poses]
-    steps = network_steps(drive.trusted)
-    calibration = calibrate_network(steps, [*geometric, *by_keyframes], scale.per_frame)
+    calibration = calibrate_network(
+        drive.network_steps, [*geometric, *by_keyframes], scale.per_frame
+    )
     logger.log(level, "pose network: %s", calibration.over(scale.per_frame))
-    networks = network_factors(steps, calibration)
+    networks = network_factors(drive.network_steps, calibration)
     if not calibration.is_measured:  # lengths in the wrong unit have no say beside measured ones
         by_geometry = {pose.ends for pose in geometric}
         networks = [factor for factor in networks if factor.ends not in by_geometry]

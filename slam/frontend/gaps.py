@@ -44,7 +44,7 @@ class Filled(NamedTuple):
 
     steps: Steps
     snippets: Sequence[SnippetPoses]
-    trusted: Sequence[SnippetPoses]
+    network_steps: Mapping[int, FloatArray]
     interpolated: Mapping[int, str]
     gap_steps: Sequence[RelativePose]
 
@@ -76,10 +76,10 @@ def interpolate_gaps(
     frozen, steps = _without_frozen(by_network, by_corners, map_poses, measured.repeated, new)
     why = "the image stands still while the camera moves"
     frames = measured.unusable | dict.fromkeys(frozen, why)
-    trusted = [snippet for snippet in measured.snippets if _is_trusted(snippet, frozen, cuts)]
+    trusted = network_steps([each for each in measured.snippets if _is_trusted(each, frozen, cuts)])
     single = (pose for pose in _poses(steps) if pose.to_index == pose.from_index + 1)
     by_image = {pose.from_index: pose.T_from_to for pose in single}
-    covered = calibration.scaled(network_steps(trusted)) | by_image
+    covered = calibration.scaled(trusted) | by_image
     # snippets of frozen images alone are still the best estimate available
     known = covered or by_network
     loose = [k for k in range(count - 1) if k not in covered]

@@ -14,7 +14,7 @@ from slam.frontend.factors import chain_odometry, make_factors
 from slam.frontend.gaps import INTERPOLATED_SOURCE
 from slam.frontend.lidar_odometry import LIDAR_SOURCE
 from slam.frontend.measured import Measured
-from slam.frontend.network_motion import NETWORK_SOURCE, STUDENT_T_DOF
+from slam.frontend.network_motion import NETWORK_SOURCE, STUDENT_T_DOF, network_steps
 from slam.frontend.scale import Scale, StepLength
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert
@@ -54,7 +54,10 @@ def test_every_measurement_becomes_a_factor_in_the_unit_of_the_scale():
     small = drive(1.0 / METRES)
     interpolated = [pose(7, 8, "interpolated", small)]
     drawn = Drive(
-        Measured(), steps=motions(STEPS, small), trusted=snippets_of(small), gap_steps=interpolated
+        Measured(),
+        steps=motions(STEPS, small),
+        network_steps=network_steps(snippets_of(small)),
+        gap_steps=interpolated,
     )
     found = make_factors(drawn, scale())
     assert {factor.source for factor in found} == {"essential", "interpolated", NETWORK_SOURCE}
@@ -92,7 +95,8 @@ def test_the_network_has_a_factor_on_every_step_that_nothing_else_measures_where
     None
 ):
     found = make_factors(
-        Drive(Measured(), motions(STEPS, TRUE), trusted=snippets_of(TRUE)), scale()
+        Drive(Measured(), motions(STEPS, TRUE), network_steps=network_steps(snippets_of(TRUE))),
+        scale(),
     )
     every = [(k, k + 1) for k in range(FRAMES - 1)]
     assert [f.ends for f in found if f.source == NETWORK_SOURCE] == [

@@ -50,7 +50,8 @@ def collected(
 def test_a_drive_without_gaps_stays_as_it_was():
     snippets, steps = snippets_of(steady()), [measured(steady(), 3, 4)]
     found = interpolate_gaps(collected(snippets, steps), 4)
-    assert found.snippets == found.trusted == snippets and list(found.steps.values()) == steps
+    assert found.snippets == snippets and list(found.steps.values()) == steps
+    assert list(found.network_steps) == list(range(COUNT - 1))
     assert found.gap_steps == [] and found.interpolated == {}
 
 
@@ -61,14 +62,13 @@ def test_a_gap_of_a_steady_drive_is_interpolated_exactly(gap: set[int]):
     found = closed(steady(), gap)
     assert set(found.interpolated) == gap and found.interpolated[min(gap)] == "black"
     np.testing.assert_allclose(chain_raw(found.snippets, COUNT), steady(), atol=1e-9)
-    assert not any(gap & {s.target, *s.sources} for s in found.trusted)
+    assert not any(gap & {k, k + 1} for k in found.network_steps)
     for factor in found.gap_steps:
         np.testing.assert_allclose(factor.T_from_to, STEP, atol=1e-9)
         assert factor.source == INTERPOLATED_SOURCE and factor.to_index == factor.from_index + 1
         np.testing.assert_allclose(factor.sigmas, np.repeat([np.deg2rad(2.0), 0.5], 3), rtol=1e-6)
     linked = {f.from_index for f in found.gap_steps}
-    linked |= {step for s in found.trusted for step in range(min(s.sources), max(s.sources))}
-    assert linked == set(range(COUNT - 1))
+    assert linked | found.network_steps.keys() == set(range(COUNT - 1))
 
 
 def test_a_gap_beside_steps_of_the_network_alone_has_the_unit_of_learned_depth():
@@ -202,7 +202,9 @@ def test_repeated_images_of_a_moving_camera_are_interpolated():
 
 def test_repeated_images_of_a_standing_camera_are_measurements():
     found, _ = repeating(frozen=False)
-    assert found.interpolated == {} and found.gap_steps == [] and len(found.trusted) == COUNT - 4
+    assert (
+        found.interpolated == {} and found.gap_steps == [] and len(found.network_steps) == COUNT - 1
+    )
     assert len(found.steps) == COUNT - 1
 
 

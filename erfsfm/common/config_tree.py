@@ -107,7 +107,7 @@ def read_model(model: type[M], path: Path, error: type[ErfsfmError], wrong: str)
 
 def dump_yaml(config: BaseModel) -> str:
     """The configuration as YAML that reads back to an equal configuration."""
-    text: str = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+    text: str = yaml.dump(config.model_dump(mode="json"), Dumper=_Dumper, sort_keys=False)
     return text
 
 
@@ -119,7 +119,7 @@ def dump_explained(config: BaseModel) -> str:
         lines += [*([""] if lines else []), f"{name}:  # {summary}"]
         for key, value in section.model_dump(mode="json").items():
             text = (
-                yaml.safe_dump(value, default_flow_style=True, width=10_000)
+                yaml.dump(value, Dumper=_Dumper, default_flow_style=True, width=10_000)
                 .removesuffix("...\n")
                 .strip()
             )
@@ -267,9 +267,14 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
+class _Dumper(yaml.SafeDumper):
+    """Writes text that `_Loader` would take for a number in quotes, be it the commit 8e4572260207."""
+
+
 # PyYAML follows YAML 1.1, where a float needs a dot
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"),
-    list("-+.0123456789"),
-)
+for _kind in (_Loader, _Dumper):
+    _kind.add_implicit_resolver(
+        "tag:yaml.org,2002:float",
+        re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"),
+        list("-+.0123456789"),
+    )

@@ -31,7 +31,8 @@ class SimulationOptions:
     A ``varied`` street is a town's, an avenue, a country road or a motorway (`Variety`) with
     another camera than KITTI's, hills, hard light, fences and people, and cars that overtake if
     any move; ``varied`` rooms have another focal length. ``rate``, frames a second, and ``motion``
-    are of rooms.
+    are of rooms. ``fov_deg`` is the horizontal field of view of square pixels; None is that of the
+    world's own camera.
     """
 
     route: str = "loop"
@@ -43,6 +44,7 @@ class SimulationOptions:
     varied: bool = False
     motion: str | None = None
     rate: float = STREET_RATE
+    fov_deg: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse invalid options.

@@ -51,8 +51,8 @@ class SimulatedRooms(SimulatedWorld):
         rng = luck(options.seed, 57)
         # around their own origins, looking along x
         self._people = things(rng, [person] * _PEOPLE) if peopled else []
-        fov_deg, width, height = _USUAL_FOV_DEG, options.width, options.height
-        if options.varied:
+        fov_deg, width, height = options.fov_deg or _USUAL_FOV_DEG, options.width, options.height
+        if options.varied and options.fov_deg is None:
             fov_deg = np.exp(luck(options.seed, 55).uniform(*np.log(_VARIED_FOV_DEG)))
         focal_px = float(0.5 * width / np.tan(0.5 * np.deg2rad(fov_deg)))
         centre = 0.5 * (width - 1), 0.5 * (height - 1)

@@ -57,6 +57,8 @@ class SimulatedStreet(SimulatedWorld):
         if options.varied:
             variety = draw_variety(options.seed, options.route == "straight")
             self._weather = draw_varied_weather(options.seed)
+        if options.fov_deg is not None:
+            variety = replace(variety, fov_deg=options.fov_deg, aspect=None, centre=(0.0, 0.0))
         self._route = plan_route(options.route, options.frames, options.seed, still, variety)
         super().__init__(options, variety.camera(*size), self._route.T_street_camera)
         self.camera_height_m = self._route.camera_height_m

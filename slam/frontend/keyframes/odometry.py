@@ -61,8 +61,8 @@ _LEAST_SHIFT_PX = 16.0  # smaller ones flow finds by itself
 _LEAST_CORRELATION = 0.4
 _SURE_CORRELATION = 0.82
 _CLEAR_CORRELATION = 0.9
-# ratio of a keyframe's corners still tracked that asks for another, and in a turn for dense flow
-_KEYFRAME_TRACKS_RATIO, _FLOW_TRACKS_RATIO = 0.25, 0.35
+_KEYFRAME_TRACKS_RATIO = 0.25  # ratio of a keyframe's corners still tracked that asks for another
+_FOUND_RATIO = 0.5  # of those in view, below which a turn asks for dense flow
 # seconds without a pose after which a new map is begun, the next frame's included
 _MAX_LOST_S = 0.35
 _LAST_FRAMES = 4  # frames in which a pose is looked up
@@ -183,10 +183,11 @@ class KeyframeOdometry:
                 last.pixels[a], pixels[b], since, self._turn_rate, self._intrinsics
             )
         keyframe = segment.keyframes[-1]
-        are_few = len(track_ids) < _FLOW_TRACKS_RATIO * len(keyframe.track_ids)
+        in_view = are_inside(self._places, frame.grey.shape).sum()
+        are_few = len(track_ids) < _FOUND_RATIO * in_view
         if turn is None and are_few:
             turn = image_turn(*images)
-        # what flow of corners still finds then has mostly slipped
+        # in a turn where most corners are lost, many that are found have slipped
         turns = are_few and turn is not None and turn.correlation > _CLEAR_CORRELATION
         if not turns and self._locate(segment, frame, track_ids, pixels):
             return

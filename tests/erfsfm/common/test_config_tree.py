@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 import pytest
+from pydantic import BaseModel
 
 from erfsfm.common.config_tree import (
     MAX_BYTES,
@@ -117,6 +118,16 @@ def test_numbers_and_lists_are_read():
     assert parse_yaml("1e-4") == 1e-4
     assert parse_yaml("[1E5, -2e+3, .5e1, 1.0]") == [1e5, -2e3, 5.0, 1.0]
     assert parse_yaml("") is None
+
+
+def test_text_that_looks_like_a_number_is_read_back_as_text():
+    """One commit in a hundred is written as 8e4572260207."""
+
+    class Record(BaseModel):
+        commit: str
+
+    for commit in ("8e4572260207", "1e5", "123456789012", "1.5", "null", "-.5E+3"):
+        assert parse_yaml(dump_yaml(Record(commit=commit))) == {"commit": commit}
 
 
 def test_files(tmp_path: Path):

@@ -10,11 +10,9 @@ from functools import cached_property
 import numpy as np
 
 from slam.frames import Ends, RelativePose, SnippetPoses, TrackingEvent, View, runs
-from slam.frontend.gaps import interpolate_gaps
 from slam.frontend.keyframes.relative_poses import NO_MAPS, KeyframePoses
 from slam.frontend.measured import FrontEnd, Keyframe, Measured, named
-from slam.frontend.road import RoadStep, with_slope
-from slam.frontend.rotations import smooth_rotations
+from slam.frontend.road import RoadStep
 from slam.frontend.visual.motion import Motion, Steps, triangulated
 from slam.geometry.se3 import FloatArray, path_distance
 
@@ -189,50 +187,6 @@ def _segments(begins: Mapping[int, str], ends: Collection[int]) -> list[Segment]
         Segment(first, last, begins[first])
         for first, last in zip(sorted(begins), sorted(ends), strict=True)
     ]
-
-
-def complete_drive(
-    measured: Measured,
-    sources: int,
-    map_poses: KeyframePoses = NO_MAPS,
-    joins: Sequence[TrackingEvent] = (),
-) -> Drive:
-    """The drive with its gaps interpolated, its rotations smoothed, its road by its path, and its segments.
-
-    More frames may follow: what was measured stays as it is.
-
-    Args:
-        measured: as it was collected.
-        sources: frames of a snippet besides its target.
-        map_poses: poses by the maps of keyframes of the drive.
-        joins: events of loops that join these maps.
-
-    Raises:
-        SlamError: no snippet was measured, so there is no motion to extrapolate.
-    """
-    if measured.is_upside_down:
-        measured = replace(measured, roads=[None] * len(measured), road_steps={})
-    ends = {*measured.steps, *map_poses.steps}
-    cuts = find_cuts(measured.failures, ends, {*measured.unusable, *measured.repeated})
-    filled = interpolate_gaps(measured, sources, cuts, map_poses)
-    smoothed = smooth_rotations(filled.steps, measured.relative_rotations)
-    return Drive(
-        measured,
-        smoothed,
-        with_slope(measured.road_steps, smoothed),
-        filled.snippets,
-        filled.network_steps,
-        filled.interpolated,
-        filled.gap_steps,
-        find_segments(
-            len(measured),
-            cuts,
-            filled.interpolated,
-            lambda first: map_poses.across(first) is not None,
-        ),
-        map_poses,
-        sorted([*measured.events, *joins], key=lambda event: event.frame),
-    )
 
 
 def warn_of_doubts(drive: Drive) -> None:

@@ -1,4 +1,4 @@
-"""Gaps of a drive, interpolated after its last frame.
+"""A drive completed after its last frame: gaps interpolated, rotations smoothed, its road and its segments.
 
 Frames without a measurement follow the constant-velocity model, with wide sigmas.
 """
@@ -7,14 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
-from slam.frames import RelativePose, SnippetPoses, runs
+from slam.frames import RelativePose, SnippetPoses, TrackingEvent, runs
+from slam.frontend.drive import Drive, find_cuts, find_segments
 from slam.frontend.keyframes.relative_poses import NO_MAPS, KeyframePoses
 from slam.frontend.measured import Measured
 from slam.frontend.network_motion import calibrate_network, network_steps
+from slam.frontend.road import with_slope
+from slam.frontend.rotations import smooth_rotations
 from slam.frontend.visual.motion import Motion, Steps
 from slam.geometry.robust import median
 from slam.geometry.se3 import (
@@ -39,19 +41,48 @@ _ROTATION_SIGMA_DEG = 2.0  # rotation sigma of an interpolated step, degrees
 _TRANSLATION_RELATIVE_SIGMA = 0.5  # translation sigma over the length of an interpolated step
 
 
-class Filled(NamedTuple):
-    """What is known of all frames: the records of `slam.frontend.drive.Drive` of the same names."""
+def complete_drive(
+    measured: Measured,
+    sources: int,
+    map_poses: KeyframePoses = NO_MAPS,
+    joins: Sequence[TrackingEvent] = (),
+) -> Drive:
+    """The drive with its gaps interpolated, its rotations smoothed, its road by its path, and its segments.
 
-    steps: Steps
-    snippets: Sequence[SnippetPoses]
-    network_steps: Mapping[int, FloatArray]
-    interpolated: Mapping[int, str]
-    gap_steps: Sequence[RelativePose]
+    More frames may follow: what was measured stays as it is.
+
+    Args:
+        measured: as it was collected.
+        sources: frames of a snippet besides its target.
+        map_poses: poses by the maps of keyframes of the drive.
+        joins: events of loops that join these maps.
+
+    Raises:
+        SlamError: no snippet was measured, so there is no motion to extrapolate.
+    """
+    if measured.is_upside_down:
+        measured = replace(measured, roads=[None] * len(measured), road_steps={})
+    ends = {*measured.steps, *map_poses.steps}
+    cuts = find_cuts(measured.failures, ends, {*measured.unusable, *measured.repeated})
+    drive = interpolate_gaps(measured, sources, cuts, map_poses)
+    steps = smooth_rotations(drive.steps, measured.relative_rotations)
+    return replace(
+        drive,
+        steps=steps,
+        road_steps=with_slope(measured.road_steps, steps),
+        segments=find_segments(
+            len(measured),
+            cuts,
+            drive.interpolated,
+            lambda first: map_poses.across(first) is not None,
+        ),
+        events=sorted([*measured.events, *joins], key=lambda event: event.frame),
+    )
 
 
 def interpolate_gaps(
     measured: Measured, sources: int, cuts: Collection[int] = (), map_poses: KeyframePoses = NO_MAPS
-) -> Filled:
+) -> Drive:
     """Steps and snippets also in the gaps, and without what was measured on interpolated frames.
 
     Steps over a gap are between its two ends. No snippet measures across a cut.
@@ -89,12 +120,16 @@ def interpolate_gaps(
         if len(over) > 1 and set(loose).issuperset(over):
             motion |= dict.fromkeys(over, equal_step(pose.T_from_to, len(over)))
     typical = median([np.linalg.norm(T[:3, 3]) for T in known.values()])
-    return Filled(
+    return Drive(
+        measured,
         steps,
-        _filled(measured.snippets, _completed(raw, range(count - 1)), count, sources),
-        trusted,
-        dict(sorted(frames.items())),
-        [_guess(k, motion[k], max(typical, map_poses.across(k + 1) or 0.0)) for k in loose],
+        snippets=_filled(measured.snippets, _completed(raw, range(count - 1)), count, sources),
+        network_steps=trusted,
+        interpolated=dict(sorted(frames.items())),
+        gap_steps=[
+            _guess(k, motion[k], max(typical, map_poses.across(k + 1) or 0.0)) for k in loose
+        ],
+        map_poses=map_poses,
     )
 
 

@@ -17,8 +17,9 @@ from erfsfm.common.readers.camera_file import HIGHEST_M, impossible
 from slam.config.sections import SlamConfig
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image, Intrinsics, Predictor
-from slam.frontend.drive import Drive, complete_drive
+from slam.frontend.drive import Drive
 from slam.frontend.factors import chain_odometry, make_factors
+from slam.frontend.gaps import complete_drive
 from slam.frontend.measured import Measured
 from slam.frontend.scale import Scale, Unit, find_scale
 from slam.geometry.se3 import FloatArray, apply, compose, in_unit, invert

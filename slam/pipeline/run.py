@@ -22,9 +22,10 @@ from slam.frames import Frame, GpsTrack, Predictor, RelativePose, View
 from slam.frames import Sequence as FrameSequence
 from slam.frontend import agreement
 from slam.frontend.agreement import Agreement
-from slam.frontend.drive import Drive, complete_drive, warn_of_doubts
+from slam.frontend.drive import Drive, warn_of_doubts
 from slam.frontend.factors import chain_odometry, make_factors
 from slam.frontend.fixed_mask import LEAST_IMAGES, FixedMask, warn_of_fixed
+from slam.frontend.gaps import complete_drive
 from slam.frontend.gps import GpsFixes, Location
 from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.lidar_odometry import LIDAR_SOURCE, LidarPath, lidar_path, usable_steps

@@ -15,8 +15,9 @@ from slam.config.sections import (
     VisualOdometryConfig,
 )
 from slam.frames import DepthMap, Frame, RelativePose
-from slam.frontend.drive import Drive, complete_drive
+from slam.frontend.drive import Drive
 from slam.frontend.front_end import MotionTracker, choose
+from slam.frontend.gaps import complete_drive
 from slam.frontend.keyframes.relative_poses import keyframe_poses
 from slam.frontend.measured import FrontEnd, Measured
 from slam.frontend.visual.motion import Motion

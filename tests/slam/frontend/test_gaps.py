@@ -11,7 +11,8 @@ import pytest
 from oracle import snippets_of
 
 from slam.frames import KEYFRAME_SOURCE, RelativePose, SnippetPoses
-from slam.frontend.gaps import INTERPOLATED_SOURCE, Filled, interpolate_gaps
+from slam.frontend.drive import Drive
+from slam.frontend.gaps import INTERPOLATED_SOURCE, interpolate_gaps
 from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.measured import Measured
 from slam.frontend.network_motion import chain_raw
@@ -33,7 +34,7 @@ def measured(T_world_camera: FloatArray, first: int, last: int) -> Motion:
     return Motion(RelativePose(first, last, T_from_to, np.full(6, 0.01), "essential"))
 
 
-def closed(T_world_camera: FloatArray, unusable: set[int], *steps: Motion) -> Filled:
+def closed(T_world_camera: FloatArray, unusable: set[int], *steps: Motion) -> Drive:
     reasons = dict.fromkeys(unusable, "black")
     return interpolate_gaps(
         collected(snippets_of(T_world_camera, unusable=unusable), steps, unusable=reasons), 4
@@ -173,7 +174,7 @@ def drifting() -> FloatArray:
     )
 
 
-def repeating(frozen: bool) -> tuple[Filled, FloatArray]:
+def repeating(frozen: bool) -> tuple[Drive, FloatArray]:
     """Ten repeated images: the camera moved, or stood."""
     T_steps = np.tile(STEP, (COUNT - 1, 1, 1))
     if not frozen:

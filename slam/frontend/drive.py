@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -47,7 +47,8 @@ class Drive:
         network_steps: ``T_k_next`` by k, unscaled, of the snippets that it measured on usable frames.
         interpolated: the frames of gaps, with the reason.
         gap_steps: the steps of gaps.
-        segments: parts of the drive that no measurement relates.
+        cuts: frames that show another place than the frame before.
+        segments: parts of the drive that no measurement relates; known once it is `parted`.
         map_poses: poses by the maps of keyframes.
         events: what became of these maps.
     """
@@ -59,6 +60,7 @@ class Drive:
     network_steps: Mapping[int, FloatArray] = field(default_factory=dict)
     interpolated: Mapping[int, str] = field(default_factory=dict)
     gap_steps: Sequence[RelativePose] = ()
+    cuts: Sequence[int] = ()
     segments: Sequence[Segment] = ()
     map_poses: KeyframePoses = NO_MAPS
     events: Sequence[TrackingEvent] = ()
@@ -115,17 +117,32 @@ class Drive:
         return support
 
     def parted(self, T_world_camera: FloatArray) -> Drive:
-        """The drive with a new segment after each step of a trajectory ``(N, 4, 4)`` that no camera makes.
+        """The drive with its segments, by its cuts and its long gaps that no map of keyframes relates.
 
-        Measurements that contradict each other leave such steps.
+        One also begins after each step of its trajectory ``(N, 4, 4)`` that no camera makes: maps that contradict each
+        other leave such steps.
         """
-        lengths = np.diff(path_distance(T_world_camera))
-        leaps = np.flatnonzero(lengths > _LEAP * np.quantile(lengths, _USUAL))
-        lasts = [k for k in leaps.tolist() if {k, k + 1}.isdisjoint(self.interpolated)]
-        begins = dict.fromkeys([k + 1 for k in lasts], "no camera makes the step to it")
-        begins |= {part.first: part.reason for part in self.segments}
-        ends = {part.last for part in self.segments}.union(lasts)
-        return replace(self, segments=_segments(begins, ends))
+        begins: dict[int, str] = {}
+        if self.by_keyframes:
+            lengths = np.diff(path_distance(T_world_camera))
+            leaps = np.flatnonzero(lengths > _LEAP * np.quantile(lengths, _USUAL)) + 1
+            seen = [k for k in leaps.tolist() if {k - 1, k}.isdisjoint(self.interpolated)]
+            begins |= dict.fromkeys(seen, "no camera makes the step to it")
+        across = self.map_poses.across
+        between = [cut for cut in self.cuts if across(cut) is None]
+        begins |= dict.fromkeys(between, "it shows another place than the frame before")
+        ends = {len(self) - 1}.union(k - 1 for k in begins)
+        for first, last in runs(self.interpolated):
+            frames, after = last - first + 1, last + 1
+            is_inside = first > 0 and after < len(self)
+            if frames > _LONGEST_GAP and is_inside and across(after) is None:
+                ends.add(first - 1)
+                begins[after] = (
+                    f"{frames} frames before it are interpolated: {self.interpolated[first]}"
+                )
+        begins[0] = ""
+        pairs = zip(sorted(begins), sorted(ends), strict=True)
+        return replace(self, segments=[Segment(*each, begins[each[0]]) for each in pairs])
 
 
 def find_cuts(
@@ -147,46 +164,6 @@ def find_cuts(
         if found < _LEAST_FOUND and alone and around.isdisjoint(doubtful):
             cuts.append(last)
     return cuts
-
-
-def find_segments(
-    count: int,
-    cuts: Collection[int],
-    interpolated: Mapping[int, str],
-    is_related: Callable[[int], bool],
-) -> list[Segment]:
-    """The segments of a drive, by its cuts and its long gaps.
-
-    Args:
-        count: frames of the drive.
-        cuts: frames that show another place than the frame before.
-        interpolated: frames of gaps, with the reason.
-        is_related: tells of a frame whether a map of keyframes relates the frames from it on to
-            those before.
-    """
-    between = [cut for cut in cuts if not is_related(cut)]
-    begins = {0: ""} | dict.fromkeys(between, "it shows another place than the frame before")
-    ends = {count - 1} | {cut - 1 for cut in between}
-    for first, last in runs(interpolated):
-        if (
-            last - first + 1 > _LONGEST_GAP
-            and first > 0
-            and last + 1 < count
-            and not is_related(last + 1)
-        ):
-            ends.add(first - 1)
-            begins[last + 1] = (
-                f"{last - first + 1} frames before it are interpolated: {interpolated[first]}"
-            )
-    return _segments(begins, ends)
-
-
-def _segments(begins: Mapping[int, str], ends: Collection[int]) -> list[Segment]:
-    """By their first frames with the reasons, and by their last frames."""
-    return [
-        Segment(first, last, begins[first])
-        for first, last in zip(sorted(begins), sorted(ends), strict=True)
-    ]
 
 
 def warn_of_doubts(drive: Drive) -> None:

@@ -1,4 +1,4 @@
-"""A drive completed after its last frame: gaps interpolated, rotations smoothed, its road and its segments.
+"""A drive completed after its last frame: gaps interpolated, rotations smoothed, and its road.
 
 Frames without a measurement follow the constant-velocity model, with wide sigmas.
 """
@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from slam.frames import RelativePose, SnippetPoses, TrackingEvent, runs
-from slam.frontend.drive import Drive, find_cuts, find_segments
+from slam.frontend.drive import Drive, find_cuts
 from slam.frontend.keyframes.relative_poses import NO_MAPS, KeyframePoses
 from slam.frontend.measured import Measured
 from slam.frontend.network_motion import calibrate_network, network_steps
@@ -47,7 +47,7 @@ def complete_drive(
     map_poses: KeyframePoses = NO_MAPS,
     joins: Sequence[TrackingEvent] = (),
 ) -> Drive:
-    """The drive with its gaps interpolated, its rotations smoothed, its road by its path, and its segments.
+    """The drive with its gaps interpolated, its rotations smoothed, and its road by its path.
 
     More frames may follow: what was measured stays as it is.
 
@@ -70,18 +70,12 @@ def complete_drive(
         drive,
         steps=steps,
         road_steps=with_slope(measured.road_steps, steps),
-        segments=find_segments(
-            len(measured),
-            cuts,
-            drive.interpolated,
-            lambda first: map_poses.across(first) is not None,
-        ),
         events=sorted([*measured.events, *joins], key=lambda event: event.frame),
     )
 
 
 def interpolate_gaps(
-    measured: Measured, sources: int, cuts: Collection[int] = (), map_poses: KeyframePoses = NO_MAPS
+    measured: Measured, sources: int, cuts: Sequence[int] = (), map_poses: KeyframePoses = NO_MAPS
 ) -> Drive:
     """Steps and snippets also in the gaps, and without what was measured on interpolated frames.
 
@@ -129,6 +123,7 @@ def interpolate_gaps(
         gap_steps=[
             _guess(k, motion[k], max(typical, map_poses.across(k + 1) or 0.0)) for k in loose
         ],
+        cuts=cuts,
         map_poses=map_poses,
     )
 

@@ -175,8 +175,7 @@ class SlamPipeline:
         if isinstance(solved, Failed):
             solved = solved, T_odometry, LoopClosures(not_sought=solved.reason), location
         graph, T_optimised, loops, location = solved
-        if drive.by_keyframes:
-            drive = drive.parted(T_optimised)
+        drive = drive.parted(T_optimised)
         agreements, confidence, shape = self._confidence(
             drive, scale, T_odometry, agreements, graph
         )

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from slam.frontend.drive import Segment, find_cuts, find_segments
+import numpy as np
+
+from slam.frames import RelativePose
+from slam.frontend.drive import Drive, Segment, find_cuts
+from slam.frontend.keyframes.relative_poses import NO_MAPS, KeyframePoses
+from slam.frontend.measured import Measured
 
 STEPS = [(k, k + 1) for k in range(9)]
 
@@ -18,18 +23,15 @@ def test_a_single_failed_step_between_measured_ones_is_a_cut():
 
 
 def test_segments_begin_at_cuts_and_after_long_gaps_that_no_map_of_keyframes_relates():
-    def never(_: int) -> bool:
-        return False
+    def segments(cuts: list[int], gap: range, maps: KeyframePoses = NO_MAPS) -> list[Segment]:
+        dark, measured = dict.fromkeys(gap, "blank"), Measured(roads=[None] * 200)
+        drive = Drive(measured, interpolated=dark, cuts=cuts, map_poses=maps)
+        return drive.parted(np.eye(4)[None]).segments
 
-    assert find_segments(10, [], {}, never) == [Segment(0, 9, "")]
-    dark = dict.fromkeys(range(100, 140), "blank")
-    assert find_segments(200, [50], dark, never) == [
-        Segment(0, 49, ""),
-        Segment(50, 99, "it shows another place than the frame before"),
-        Segment(140, 199, "40 frames before it are interpolated: blank"),
-    ]
-    assert len(find_segments(200, [], dict.fromkeys(range(100, 120), "blank"), never)) == 1
-    assert find_segments(200, [50], dark, lambda first: first == 140) == [
-        Segment(0, 49, ""),
-        Segment(50, 199, "it shows another place than the frame before"),
-    ]
+    assert segments([], range(100, 120)) == [Segment(0, 199, "")]
+    long, why = range(100, 140), "it shows another place than the frame before"
+    after = Segment(140, 199, "40 frames before it are interpolated: blank")
+    assert segments([50], long) == [Segment(0, 49, ""), Segment(50, 99, why), after]
+    over = RelativePose(99, 140, np.eye(4), np.ones(6), "keyframes")
+    maps = KeyframePoses([over], {99: 0, 140: 0})
+    assert segments([50], long, maps) == [Segment(0, 49, ""), Segment(50, 199, why)]

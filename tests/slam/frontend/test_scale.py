@@ -81,12 +81,8 @@ def find(
     return find_scale(Unit(mode, height_m if is_stated else None), *measurements)
 
 
-def lengths(scale: Scale) -> dict[Ends, float]:
-    return {ends: length.value for ends, length in scale.lengths.items()}
-
-
 def assert_lengths(scale: Scale, expected: dict[Ends, float], rtol: float) -> None:
-    found = lengths(scale)
+    found = {ends: length.value for ends, length in scale.lengths.items()}
     assert found.keys() == expected.keys()
     np.testing.assert_allclose(
         [found[ends] for ends in expected], list(expected.values()), rtol=rtol

@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 
 from slam import run_slam
+from slam.geometry.se3 import FloatArray, rotation_angle
 from slam.results.folder import RunFolder
+from slam.simulation.options import SimulationOptions
+from slam.simulation.recording import write_kitti_root
+from slam.simulation.rooms import SimulatedRooms
 
 QUICK = ("mapping.enabled=false", "output.report=false")
 ATE_M = 0.052  # measured; each run may have twice that
@@ -54,6 +58,30 @@ def test_seeds_of_a_carried_camera(recording: str, mean_m: float, data_root: Pat
         errors.append(optimised["align"]["7dof"]["ate_rmse_m"])
     mean = float(np.mean(errors))
     assert mean < 1.3 * mean_m and max(errors) < MOST_SPREAD * mean, errors
+
+
+def turns_of_a_second(R_world_camera: FloatArray) -> FloatArray:
+    """``R_camera_later`` ``(N - 25, 3, 3)`` at 25 frames a second."""
+    return np.swapaxes(R_world_camera[:-25], 1, 2) @ R_world_camera[25:]
+
+
+@pytest.mark.slow
+def test_a_blurred_camera_of_changing_exposure_turns_on_the_spot(tmp_path: Path):
+    """Corners found on plain walls slip: without dense flow, 95 % of rotations err by up to 4.6 degrees."""
+    world = SimulatedRooms(
+        SimulationOptions(
+            "rooms", 300, 770, 480, 360, ("blur", "exposure"), motion="turn", rate=25.0
+        )
+    )
+    root = tmp_path / "world"
+    write_kitti_root(world, root, depth=False, lidar=False)
+    run = run_slam(root, output=tmp_path / "run", overrides=QUICK, device="cpu")
+    found, true = (
+        turns_of_a_second(T[:, :3, :3])
+        for T in (run.trajectory("optimised").T_world_camera, world.T_world_camera)
+    )
+    errors = np.rad2deg(rotation_angle(np.swapaxes(found, 1, 2) @ true))
+    assert np.percentile(errors, 95) < 3.0
 
 
 @pytest.mark.slow

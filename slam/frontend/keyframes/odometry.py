@@ -185,8 +185,6 @@ class KeyframeOdometry:
         keyframe = segment.keyframes[-1]
         in_view = are_inside(self._places, frame.grey.shape).sum()
         are_few = len(track_ids) < _FOUND_RATIO * in_view
-        if turn is None and are_few:
-            turn = image_turn(*images)
         # in a turn where most corners are lost, many that are found have slipped
         turns = are_few and turn is not None and turn.correlation > _CLEAR_CORRELATION
         if not turns and self._locate(segment, frame, track_ids, pixels):

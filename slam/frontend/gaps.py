@@ -5,7 +5,7 @@ Frames without a measurement follow the constant-velocity model, with wide sigma
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -91,17 +91,18 @@ def interpolate_gaps(
         SlamError: no snippet was measured, so there is no motion to extrapolate.
     """
     count = len(measured)
-    if not measured.snippets:
+    snippets = measured.snippets.values()
+    if not snippets:
         why = next(iter(measured.unusable.values()), "the sequence is too short")
         raise SlamError(f"no {sources + 1} usable frames in a row among {count}: {why}")
     new = set(range(count)).difference(measured.unusable, measured.repeated)
-    raw, by_corners = network_steps(measured.snippets), measured.steps
+    raw, by_corners = network_steps(snippets), measured.steps
     calibration = calibrate_network(raw, _poses(by_corners), np.ones(count))
     by_network = calibration.scaled(raw)
     frozen, steps = _without_frozen(by_network, by_corners, map_poses, measured.repeated, new)
     why = "the image stands still while the camera moves"
     frames = measured.unusable | dict.fromkeys(frozen, why)
-    trusted = network_steps([each for each in measured.snippets if _is_trusted(each, frozen, cuts)])
+    trusted = network_steps([each for each in snippets if _is_trusted(each, frozen, cuts)])
     single = (pose for pose in _poses(steps) if pose.to_index == pose.from_index + 1)
     by_image = {pose.from_index: pose.T_from_to for pose in single}
     covered = calibration.scaled(trusted) | by_image
@@ -117,7 +118,7 @@ def interpolate_gaps(
     return Drive(
         measured,
         steps,
-        snippets=_filled(measured.snippets, _completed(raw, range(count - 1)), count, sources),
+        snippets=_filled(snippets, _completed(raw, range(count - 1)), count, sources),
         network_steps=trusted,
         interpolated=dict(sorted(frames.items())),
         gap_steps=[
@@ -210,7 +211,7 @@ def _completed(known: Mapping[int, FloatArray], steps: Collection[int]) -> dict[
 
 
 def _filled(
-    snippets: Sequence[SnippetPoses], steps: Mapping[int, FloatArray], count: int, sources: int
+    snippets: Iterable[SnippetPoses], steps: Mapping[int, FloatArray], count: int, sources: int
 ) -> list[SnippetPoses]:
     """One snippet a target; missing ones are chained from single steps."""
     by_target = {snippet.target: snippet for snippet in snippets}

@@ -12,7 +12,7 @@ from oracle import snippets_of
 
 from slam.frames import KEYFRAME_SOURCE, RelativePose
 from slam.frontend.drive import Drive
-from slam.frontend.gaps import INTERPOLATED_SOURCE, interpolate_gaps
+from slam.frontend.gaps import INTERPOLATED_SOURCE, complete_drive, find_cuts
 from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.measured import Measured
 from slam.frontend.network_motion import chain_raw
@@ -35,7 +35,7 @@ def measured(T_world_camera: FloatArray, first: int, last: int) -> Motion:
 
 
 def closed(T_world_camera: FloatArray, unusable: set[int], *steps: Motion) -> Drive:
-    return interpolate_gaps(collected(T_world_camera, steps, unusable), 4)
+    return complete_drive(collected(T_world_camera, steps, unusable), 4)
 
 
 def collected(
@@ -55,7 +55,7 @@ def collected(
 
 def test_a_drive_without_gaps_stays_as_it_was():
     recorded = collected(steady(), [measured(steady(), 3, 4)])
-    found = interpolate_gaps(recorded, 4)
+    found = complete_drive(recorded, 4)
     assert found.snippets == [*recorded.snippets.values()] and found.steps == recorded.steps
     assert list(found.network_steps) == list(range(COUNT - 1))
     assert found.gap_steps == [] and found.interpolated == {}
@@ -131,8 +131,8 @@ def test_a_long_gap_ends_where_one_map_says(is_one_map: bool):
             T = invert(truth[first]) @ truth[last]
             sigmas = np.full(6, max(0.02 * np.linalg.norm(T[:3, 3]), 1e-3))
             by_map.append(RelativePose(first, last, T, sigmas, KEYFRAME_SOURCE))
-    guesses = interpolate_gaps(
-        collected(truth, (), blank), 4, (), KeyframePoses(by_map, numbers)
+    guesses = complete_drive(
+        collected(truth, (), blank), 4, KeyframePoses(by_map, numbers)
     ).gap_steps
     graph = PoseGraph()
     graph.add_relative(*guesses, *by_map)
@@ -179,7 +179,7 @@ def repeating(frozen: bool) -> tuple[Drive, FloatArray]:
     seen = true.copy()
     seen[15:25] = seen[14]
     steps = [measured(seen, k, k + 1) for k in range(COUNT - 1)]
-    return interpolate_gaps(collected(seen, steps, repeated=list(range(15, 25))), 4), true
+    return complete_drive(collected(seen, steps, repeated=list(range(15, 25))), 4), true
 
 
 def test_repeated_images_of_a_moving_camera_are_interpolated():
@@ -205,10 +205,20 @@ def test_repeated_images_of_a_standing_camera_are_measurements():
 
 def test_repetition_to_the_end_is_standing_still():
     still = np.tile(np.eye(4), (COUNT, 1, 1))
-    found = interpolate_gaps(collected(still, repeated=list(range(1, COUNT))), 4)
+    found = complete_drive(collected(still, repeated=list(range(1, COUNT))), 4)
     assert found.interpolated == {} and found.gap_steps == []
 
 
 def test_without_any_snippet_there_is_one_error():
     with pytest.raises(SlamError, match="no 5 usable frames in a row among 40: black"):
         closed(steady(), set(range(3, COUNT, 4)))
+
+
+def test_a_single_failed_step_between_measured_ones_is_a_cut():
+    measured = [(k, k + 1) for k in range(9) if k != 4]
+    assert find_cuts({(4, 5): 0.02}, measured, ()) == [5]
+    assert find_cuts({(4, 5): 0.02}, measured, {5}) == [], "the image is unusable"
+    two = [ends for ends in measured if ends != (5, 6)]
+    assert find_cuts({(4, 5): 0.0, (5, 6): 0.0}, two, ()) == [], "one bad image fails two steps"
+    assert find_cuts({(3, 5): 0.0}, measured, ()) == []
+    assert find_cuts({(4, 5): 0.5}, measured, ()) == [], "half of the image is another car"

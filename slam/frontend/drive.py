@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -19,8 +19,6 @@ from slam.geometry.se3 import FloatArray, path_distance
 logger = logging.getLogger(__name__)
 
 DOUBLED = "the image repeats the one before while the camera moves"
-# of the corners: across a cut few are found again, by chance, before a lorry half of them
-_LEAST_FOUND = 0.2
 _LONGEST_GAP = 30  # interpolated frames, after which the place is only guessed
 # a step so many times as long as nine of ten is none of a camera: about 100 medians
 _LEAP, _USUAL = 50.0, 0.9
@@ -143,27 +141,6 @@ class Drive:
         begins[0] = ""
         pairs = zip(sorted(begins), sorted(ends), strict=True)
         return replace(self, segments=[Segment(*each, begins[each[0]]) for each in pairs])
-
-
-def find_cuts(
-    failures: Mapping[Ends, float], measured: Collection[Ends], doubtful: Collection[int]
-) -> list[int]:
-    """Frames that show another place than the frame before: their step failed, the steps before and after did not.
-
-    Args:
-        failures: steps that image geometry could not measure, and the share of corners that were
-            found again.
-        measured: steps that it measured.
-        doubtful: frames that are unusable or repeat the one before.
-    """
-    ends = set(measured)
-    cuts = []
-    for (first, last), found in failures.items():
-        around = {first - 1, first, last, last + 1}
-        alone = last == first + 1 and {(first - 1, first), (last, last + 1)} <= ends
-        if found < _LEAST_FOUND and alone and around.isdisjoint(doubtful):
-            cuts.append(last)
-    return cuts
 
 
 def warn_of_doubts(drive: Drive) -> None:

@@ -1,17 +1,17 @@
-"""A drive completed after its last frame: gaps interpolated, rotations smoothed, and its road.
+"""A drive completed after its last frame: cuts found, gaps interpolated, rotations smoothed, and its road.
 
 Frames without a measurement follow the constant-velocity model, with wide sigmas.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from slam.frames import RelativePose, SnippetPoses, TrackingEvent, runs
-from slam.frontend.drive import Drive, find_cuts
+from slam.frames import Ends, RelativePose, SnippetPoses, TrackingEvent, runs
+from slam.frontend.drive import Drive
 from slam.frontend.keyframes.relative_poses import NO_MAPS, KeyframePoses
 from slam.frontend.measured import Measured
 from slam.frontend.network_motion import calibrate_network, network_steps
@@ -31,6 +31,8 @@ from slam.geometry.se3 import (
 from slam.runtime.errors import SlamError
 
 INTERPOLATED_SOURCE = "interpolated"
+# of the corners: across a cut few are found again, by chance, before a lorry half of them
+_LEAST_FOUND = 0.2
 _STEPS_OF_A_MOTION = 3
 # the first step of a camera that stood, in steps before it stood
 _LONGEST_START = 2.0
@@ -64,7 +66,7 @@ def complete_drive(
         measured = replace(measured, roads=[None] * len(measured), road_steps={})
     ends = {*measured.steps, *map_poses.steps}
     cuts = find_cuts(measured.failures, ends, {*measured.unusable, *measured.repeated})
-    drive = interpolate_gaps(measured, sources, cuts, map_poses)
+    drive = _interpolated(measured, sources, cuts, map_poses)
     steps = smooth_rotations(drive.steps, measured.relative_rotations)
     return replace(
         drive,
@@ -74,8 +76,29 @@ def complete_drive(
     )
 
 
-def interpolate_gaps(
-    measured: Measured, sources: int, cuts: Sequence[int] = (), map_poses: KeyframePoses = NO_MAPS
+def find_cuts(
+    failures: Mapping[Ends, float], measured: Collection[Ends], doubtful: Collection[int]
+) -> list[int]:
+    """Frames that show another place than the frame before: their step failed, the steps before and after did not.
+
+    Args:
+        failures: steps that image geometry could not measure, and the share of corners that were
+            found again.
+        measured: steps that it measured.
+        doubtful: frames that are unusable or repeat the one before.
+    """
+    ends = set(measured)
+    cuts = []
+    for (first, last), found in failures.items():
+        around = {first - 1, first, last, last + 1}
+        alone = last == first + 1 and {(first - 1, first), (last, last + 1)} <= ends
+        if found < _LEAST_FOUND and alone and around.isdisjoint(doubtful):
+            cuts.append(last)
+    return cuts
+
+
+def _interpolated(
+    measured: Measured, sources: int, cuts: Sequence[int], map_poses: KeyframePoses
 ) -> Drive:
     """Steps and snippets also in the gaps, and without what was measured on interpolated frames.
 
@@ -91,17 +114,18 @@ def interpolate_gaps(
         SlamError: no snippet was measured, so there is no motion to extrapolate.
     """
     count = len(measured)
-    if not measured.snippets:
+    snippets = measured.snippets.values()
+    if not snippets:
         why = next(iter(measured.unusable.values()), "the sequence is too short")
         raise SlamError(f"no {sources + 1} usable frames in a row among {count}: {why}")
     new = set(range(count)).difference(measured.unusable, measured.repeated)
-    raw, by_corners = network_steps(measured.snippets), measured.steps
+    raw, by_corners = network_steps(snippets), measured.steps
     calibration = calibrate_network(raw, _poses(by_corners), np.ones(count))
     by_network = calibration.scaled(raw)
     frozen, steps = _without_frozen(by_network, by_corners, map_poses, measured.repeated, new)
     why = "the image stands still while the camera moves"
     frames = measured.unusable | dict.fromkeys(frozen, why)
-    trusted = network_steps([each for each in measured.snippets if _is_trusted(each, frozen, cuts)])
+    trusted = network_steps([each for each in snippets if _is_trusted(each, frozen, cuts)])
     single = (pose for pose in _poses(steps) if pose.to_index == pose.from_index + 1)
     by_image = {pose.from_index: pose.T_from_to for pose in single}
     covered = calibration.scaled(trusted) | by_image
@@ -117,7 +141,7 @@ def interpolate_gaps(
     return Drive(
         measured,
         steps,
-        snippets=_filled(measured.snippets, _completed(raw, range(count - 1)), count, sources),
+        snippets=_filled(snippets, _completed(raw, range(count - 1)), count, sources),
         network_steps=trusted,
         interpolated=dict(sorted(frames.items())),
         gap_steps=[
@@ -210,7 +234,7 @@ def _completed(known: Mapping[int, FloatArray], steps: Collection[int]) -> dict[
 
 
 def _filled(
-    snippets: Sequence[SnippetPoses], steps: Mapping[int, FloatArray], count: int, sources: int
+    snippets: Iterable[SnippetPoses], steps: Mapping[int, FloatArray], count: int, sources: int
 ) -> list[SnippetPoses]:
     """One snippet a target; missing ones are chained from single steps."""
     by_target = {snippet.target: snippet for snippet in snippets}

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Reversible, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from itertools import islice, takewhile
-from typing import Any, TypeVar
+from itertools import islice
+from typing import Any
 
 import numpy as np
 
@@ -30,8 +30,6 @@ from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.motion import Motion, RelativeRotation
 from slam.geometry.se3 import FloatArray
 from slam.runtime.memory import Spilled, SpillFile
-
-T = TypeVar("T")
 
 MAP_WIDTH_PX = 416  # of the depth that is fused: that of the networks
 _MOST_NAMED = 10  # stretches of frames in a sentence
@@ -88,7 +86,7 @@ class Measured:
     """What was measured of a drive so far, in the networks' unit of length; all of it grows at its end alone.
 
     Attributes:
-        snippets: by the pose network.
+        snippets: by the pose network, by their sources.
         steps: that image geometry measured.
         road_steps: lengths of steps by the road's homography.
         relative_rotations: rotations across two steps, by their three frames.
@@ -111,7 +109,7 @@ class Measured:
         events: what became of the maps.
     """
 
-    snippets: list[SnippetPoses] = field(default_factory=list)
+    snippets: dict[tuple[int, ...], SnippetPoses] = field(default_factory=dict)
     steps: dict[Ends, Motion] = field(default_factory=dict)
     road_steps: dict[Ends, RoadStep] = field(default_factory=dict)
     relative_rotations: dict[tuple[int, int, int], RelativeRotation] = field(default_factory=dict)
@@ -157,39 +155,6 @@ class Measured:
             name: each.copy() for name, each in vars(self).items() if isinstance(each, list | dict)
         }
         return replace(self, **own)
-
-    def since(self, first: int) -> Measured:
-        """The measurements from frame ``first`` on, which becomes frame 0; without views and keyframes.
-
-        It takes as long as there are frames since, however long the drive.
-        """
-
-        def last(items: Reversible[T], start: Callable[[T], int]) -> list[T]:
-            """The items that begin in the window, of items in order of time that may span a few frames."""
-            return list(takewhile(lambda item: start(item) >= first, reversed(items)))[::-1]
-
-        def within(items: dict[Any, T]) -> dict[Any, T]:
-            """The same of what was measured between some frames, which are renumbered."""
-            kept = last(items, lambda frames: frames[0])
-            return {tuple(k - first for k in frames): items[frames] for frames in kept}
-
-        window = Measured(
-            road_steps=within(self.road_steps),
-            relative_rotations=within(self.relative_rotations),
-            failures=within(self.failures),
-            roads=self.roads[first:],
-            unusable={k - first: why for k, why in self.unusable.items() if k >= first},
-            repeated=[k - first for k in self.repeated if k >= first],
-            below_is_nearer=self.below_is_nearer,
-        )
-        for snippet in last(self.snippets, lambda snippet: min(snippet.sources)):
-            target = snippet.target - first
-            sources = tuple(source - first for source in snippet.sources)
-            window.snippets.append(replace(snippet, target=target, sources=sources))
-        for ends, motion in within(self.steps).items():
-            pose = replace(motion.relative_pose, from_index=ends[0], to_index=ends[1])
-            window.steps[ends] = replace(motion, relative_pose=pose)
-        return window
 
 
 def named(frames: Collection[int]) -> str:

@@ -7,7 +7,7 @@ the street. Both it and the noise are measured against the steps of image geomet
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 
@@ -70,7 +70,7 @@ class NetworkCalibration:
         return {k: in_unit(T_k_next, self.unit[k]) for k, T_k_next in steps.items()}
 
 
-def network_steps(snippets: Sequence[SnippetPoses]) -> dict[int, FloatArray]:
+def network_steps(snippets: Iterable[SnippetPoses]) -> dict[int, FloatArray]:
     """``T_k_next`` by k, unscaled: the mean of the snippets that see both frames."""
     seen: dict[int, list[FloatArray]] = {}
     for snippet in snippets:

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
 
@@ -34,6 +35,8 @@ from slam.runtime.errors import Failed, SlamError
 from slam.runtime.files import MAP_MESH
 from slam.runtime.imports import import_open3d
 from slam.sequences.recording import POSSIBLE_PERIODS_S, GrowingSequence
+
+T = TypeVar("T")
 
 _WINDOW, _UPDATE = 100, 10  # frames whose poses are solved again, and between two solutions
 State = Literal["starting", "tracking", "bridged", "relocalised"]
@@ -141,7 +144,7 @@ class LivePoses:
     def _solve(self, observer: Observer, count: int) -> None:
         """Poses of the window by its own measurements, from its first one on, or from the last settled one on."""
         first = max(count - _WINDOW, 0)
-        measured = observer.measured.since(first)
+        measured = _window(observer.measured, first)
         if not measured.snippets:
             return
         by_keyframes = observer.tracker.pose(count - 1) is not None
@@ -398,6 +401,35 @@ class Slam:
         if self._estimate is None:
             raise SlamError("there are too few usable frames to solve the drive")
         return self._estimate
+
+
+def _window(measured: Measured, first: int) -> Measured:
+    """What was measured from frame ``first`` on, which becomes frame 0; without views and keyframes.
+
+    It takes as long as there are frames since, however long the drive.
+    """
+
+    def within(items: dict[Any, T]) -> dict[Any, T]:
+        """What begins in the window, by its new frames, of items in order of time that span a few."""
+        kept = list(takewhile(lambda frames: frames[0] >= first, reversed(items)))
+        return {tuple(k - first for k in frames): items[frames] for frames in reversed(kept)}
+
+    window = Measured(
+        road_steps=within(measured.road_steps),
+        relative_rotations=within(measured.relative_rotations),
+        failures=within(measured.failures),
+        roads=measured.roads[first:],
+        unusable={k - first: why for k, why in measured.unusable.items() if k >= first},
+        repeated=[k - first for k in measured.repeated if k >= first],
+        below_is_nearer=measured.below_is_nearer,
+    )
+    for sources, snippet in within(measured.snippets).items():
+        target = snippet.target - first
+        window.snippets[sources] = replace(snippet, target=target, sources=sources)
+    for ends, motion in within(measured.steps).items():
+        pose = replace(motion.relative_pose, from_index=ends[0], to_index=ends[1])
+        window.steps[ends] = replace(motion, relative_pose=pose)
+    return window
 
 
 def _require_possible(intrinsics: Intrinsics, camera_height_m: float | None) -> None:

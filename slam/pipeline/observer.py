@@ -332,7 +332,7 @@ class Observer:
 
     def _keep_snippet(self, snippet: SnippetPoses) -> None:
         if is_se3(snippet.T_source_target):
-            self.measured.snippets.append(snippet)
+            self.measured.snippets[snippet.sources] = snippet
         else:
             logger.warning("the pose network around frame %d: %s", snippet.target, NO_POSE)
 

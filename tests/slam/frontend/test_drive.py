@@ -1,25 +1,13 @@
-"""A drive is cut where a single step failed, and parted at long gaps."""
+"""A drive is parted at cuts and at long gaps."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from slam.frames import RelativePose
-from slam.frontend.drive import Drive, Segment, find_cuts
+from slam.frontend.drive import Drive, Segment
 from slam.frontend.keyframes.relative_poses import NO_MAPS, KeyframePoses
 from slam.frontend.measured import Measured
-
-STEPS = [(k, k + 1) for k in range(9)]
-
-
-def test_a_single_failed_step_between_measured_ones_is_a_cut():
-    measured = [ends for ends in STEPS if ends != (4, 5)]
-    assert find_cuts({(4, 5): 0.02}, measured, ()) == [5]
-    assert find_cuts({(4, 5): 0.02}, measured, {5}) == [], "the image is unusable"
-    two = [ends for ends in measured if ends != (5, 6)]
-    assert find_cuts({(4, 5): 0.0, (5, 6): 0.0}, two, ()) == [], "one bad image fails two steps"
-    assert find_cuts({(3, 5): 0.0}, measured, ()) == []
-    assert find_cuts({(4, 5): 0.5}, measured, ()) == [], "half of the image is another car"
 
 
 def test_segments_begin_at_cuts_and_after_long_gaps_that_no_map_of_keyframes_relates():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from itertools import pairwise
 from typing import Any
 
@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from oracle import snippets_of
 
-from slam.frames import KEYFRAME_SOURCE, RelativePose, SnippetPoses
+from slam.frames import KEYFRAME_SOURCE, RelativePose
 from slam.frontend.drive import Drive
-from slam.frontend.gaps import INTERPOLATED_SOURCE, interpolate_gaps
+from slam.frontend.gaps import INTERPOLATED_SOURCE, complete_drive, find_cuts
 from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.measured import Measured
 from slam.frontend.network_motion import chain_raw
@@ -35,23 +35,28 @@ def measured(T_world_camera: FloatArray, first: int, last: int) -> Motion:
 
 
 def closed(T_world_camera: FloatArray, unusable: set[int], *steps: Motion) -> Drive:
-    reasons = dict.fromkeys(unusable, "black")
-    return interpolate_gaps(
-        collected(snippets_of(T_world_camera, unusable=unusable), steps, unusable=reasons), 4
-    )
+    return complete_drive(collected(T_world_camera, steps, unusable), 4)
 
 
 def collected(
-    snippets: list[SnippetPoses], steps: Iterable[Motion] = (), **others: Any
+    T_world_camera: FloatArray,
+    steps: Iterable[Motion] = (),
+    unusable: Collection[int] = (),
+    **others: Any,
 ) -> Measured:
-    by_ends = {motion.ends: motion for motion in steps}
-    return Measured(snippets=snippets, steps=by_ends, roads=[None] * COUNT, **others)
+    return Measured(
+        {snippet.sources: snippet for snippet in snippets_of(T_world_camera, unusable=unusable)},
+        {motion.ends: motion for motion in steps},
+        roads=[None] * len(T_world_camera),
+        unusable=dict.fromkeys(unusable, "black"),
+        **others,
+    )
 
 
 def test_a_drive_without_gaps_stays_as_it_was():
-    snippets, steps = snippets_of(steady()), [measured(steady(), 3, 4)]
-    found = interpolate_gaps(collected(snippets, steps), 4)
-    assert found.snippets == snippets and list(found.steps.values()) == steps
+    recorded = collected(steady(), [measured(steady(), 3, 4)])
+    found = complete_drive(recorded, 4)
+    assert found.snippets == [*recorded.snippets.values()] and found.steps == recorded.steps
     assert list(found.network_steps) == list(range(COUNT - 1))
     assert found.gap_steps == [] and found.interpolated == {}
 
@@ -77,13 +82,7 @@ def test_a_gap_beside_steps_of_the_network_alone_has_the_unit_of_learned_depth()
     short = steady()
     short[:, :3, 3] *= 0.75
     steps = [measured(steady(), k, k + 1) for k in (*range(14), *range(26, COUNT - 1))]
-    unusable = set(range(17, 23))
-    found = interpolate_gaps(
-        collected(
-            snippets_of(short, unusable=unusable), steps, unusable=dict.fromkeys(unusable, "black")
-        ),
-        4,
-    )
+    found = closed(short, set(range(17, 23)), *steps)
     for factor in found.gap_steps:
         np.testing.assert_allclose(factor.T_from_to, STEP, atol=1e-9)
     np.testing.assert_allclose(chain_raw(found.snippets, COUNT), short, atol=1e-9)
@@ -132,12 +131,9 @@ def test_a_long_gap_ends_where_one_map_says(is_one_map: bool):
             T = invert(truth[first]) @ truth[last]
             sigmas = np.full(6, max(0.02 * np.linalg.norm(T[:3, 3]), 1e-3))
             by_map.append(RelativePose(first, last, T, sigmas, KEYFRAME_SOURCE))
-    recorded = Measured(
-        snippets_of(truth, unusable=blank),
-        roads=[None] * count,
-        unusable=dict.fromkeys(blank, "blank"),
-    )
-    guesses = interpolate_gaps(recorded, 4, (), KeyframePoses(by_map, numbers)).gap_steps
+    guesses = complete_drive(
+        collected(truth, (), blank), 4, KeyframePoses(by_map, numbers)
+    ).gap_steps
     graph = PoseGraph()
     graph.add_relative(*guesses, *by_map)
     start = np.tile(np.eye(4), (count, 1, 1))
@@ -183,9 +179,7 @@ def repeating(frozen: bool) -> tuple[Drive, FloatArray]:
     seen = true.copy()
     seen[15:25] = seen[14]
     steps = [measured(seen, k, k + 1) for k in range(COUNT - 1)]
-    return interpolate_gaps(
-        collected(snippets_of(seen), steps, repeated=list(range(15, 25))), 4
-    ), true
+    return complete_drive(collected(seen, steps, repeated=list(range(15, 25))), 4), true
 
 
 def test_repeated_images_of_a_moving_camera_are_interpolated():
@@ -211,13 +205,20 @@ def test_repeated_images_of_a_standing_camera_are_measurements():
 
 def test_repetition_to_the_end_is_standing_still():
     still = np.tile(np.eye(4), (COUNT, 1, 1))
-    found = interpolate_gaps(collected(snippets_of(still), repeated=list(range(1, COUNT))), 4)
+    found = complete_drive(collected(still, repeated=list(range(1, COUNT))), 4)
     assert found.interpolated == {} and found.gap_steps == []
 
 
 def test_without_any_snippet_there_is_one_error():
-    reasons = dict.fromkeys(range(3, COUNT, 4), "image 3 is truncated")
-    with pytest.raises(
-        SlamError, match="no 5 usable frames in a row among 40: image 3 is truncated"
-    ):
-        interpolate_gaps(collected([], unusable=reasons), 4)
+    with pytest.raises(SlamError, match="no 5 usable frames in a row among 40: black"):
+        closed(steady(), set(range(3, COUNT, 4)))
+
+
+def test_a_single_failed_step_between_measured_ones_is_a_cut():
+    measured = [(k, k + 1) for k in range(9) if k != 4]
+    assert find_cuts({(4, 5): 0.02}, measured, ()) == [5]
+    assert find_cuts({(4, 5): 0.02}, measured, {5}) == [], "the image is unusable"
+    two = [ends for ends in measured if ends != (5, 6)]
+    assert find_cuts({(4, 5): 0.0, (5, 6): 0.0}, two, ()) == [], "one bad image fails two steps"
+    assert find_cuts({(3, 5): 0.0}, measured, ()) == []
+    assert find_cuts({(4, 5): 0.5}, measured, ()) == [], "half of the image is another car"

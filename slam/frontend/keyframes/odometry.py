@@ -197,7 +197,8 @@ class KeyframeOdometry:
         lost = ~np.isin(flowed_ids, track_ids) & ~frame.is_fixed(flowed)
         track_ids = np.concatenate([track_ids, flowed_ids[lost]])
         pixels = np.concatenate([pixels, flowed[lost]])
-        if self._locate(segment, frame, track_ids, pixels, is_doubtful=True):
+        is_located = turns and self._locate(segment, frame, track_ids, pixels)
+        if is_located or self._locate(segment, frame, track_ids, pixels, is_doubtful=True):
             return
         if turn.correlation > _SURE_CORRELATION and not self._lost:
             self._T_camera_world = T_turned

@@ -6,7 +6,7 @@ The front end, the graph and the map never import each other; ``slam/pipeline/ru
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Hashable
+from collections.abc import Callable, Hashable
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol, TypeVar
@@ -23,7 +23,6 @@ _Kind = TypeVar("_Kind", bound=np.generic)
 Image = NDArray[np.uint8]
 Grey = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
-Pixels = NDArray[np.floating[Any]]
 DepthMap = Float32Array
 Mask = NDArray[np.bool_]
 Descriptors = NDArray[np.uint8]
@@ -100,7 +99,7 @@ class Frame:
         known: T = self._derived[key]
         return known
 
-    def is_fixed(self, pixels: Pixels) -> BoolArray:
+    def is_fixed(self, pixels: FloatArray | Float32Array) -> BoolArray:
         """Which pixels ``(M, 2)`` show what is fixed to the camera ``(M,)``."""
         if self.fixed is None:
             return np.zeros(len(pixels), np.bool_)
@@ -322,22 +321,14 @@ class GpsTrack:
     speeds: FloatArray
 
 
-def runs(frames: Collection[int]) -> list[tuple[int, int]]:
-    """Unbroken runs of frame numbers as (first, last)."""
-    known = set(frames)
-    firsts = [k for k in known if k - 1 not in known]
-    lasts = [k for k in known if k + 1 not in known]
-    return list(zip(sorted(firsts), sorted(lasts)))
-
-
-def nearest(values: NDArray[_Kind], pixels: Pixels) -> NDArray[_Kind]:
+def nearest(values: NDArray[_Kind], pixels: FloatArray | Float32Array) -> NDArray[_Kind]:
     """Values ``(M,)`` of a map ``(H, W)`` at the pixels nearest to points ``(M, 2)``."""
     u, v = np.clip(np.rint(pixels).astype(np.int64), 0, np.array(values.shape[::-1]) - 1).T
     found: NDArray[_Kind] = values[v, u]
     return found
 
 
-def nearest_depth(depth: DepthMap, pixels: Pixels) -> FloatArray:
+def nearest_depth(depth: DepthMap, pixels: FloatArray | Float32Array) -> FloatArray:
     """Depth ``(M,)`` of a map ``(H, W)`` at the pixels nearest to points ``(M, 2)``, NaN where it is unknown."""
     found = nearest(depth, pixels).astype(np.float64)
     return np.where(np.isfinite(found) & (found > 0), found, np.nan)

@@ -16,6 +16,7 @@ from erfsfm.common.files import read_text
 
 M = TypeVar("M", bound=BaseModel)
 MAX_BYTES = 2**18
+_WIDTH = 10_000  # of a line: no text is broken
 
 
 class Section(BaseModel):
@@ -107,7 +108,8 @@ def read_model(model: type[M], path: Path, error: type[ErfsfmError], wrong: str)
 
 def dump_yaml(config: BaseModel) -> str:
     """The configuration as YAML that reads back to an equal configuration."""
-    text: str = yaml.dump(config.model_dump(mode="json"), Dumper=_Dumper, sort_keys=False)
+    content = config.model_dump(mode="json")
+    text: str = yaml.dump(content, Dumper=_Dumper, sort_keys=False, width=_WIDTH)
     return text
 
 
@@ -119,7 +121,7 @@ def dump_explained(config: BaseModel) -> str:
         lines += [*([""] if lines else []), f"{name}:  # {summary}"]
         for key, value in section.model_dump(mode="json").items():
             text = (
-                yaml.dump(value, Dumper=_Dumper, default_flow_style=True, width=10_000)
+                yaml.dump(value, Dumper=_Dumper, default_flow_style=True, width=_WIDTH)
                 .removesuffix("...\n")
                 .strip()
             )

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import yaml
 
+from erfsfm.common.config_tree import dump_yaml
 from erfsfm.common.files import refuse_foreign, require_figure, save_figure
 from erfsfm.common.progress import Progress
 from erfsfm.common.readers.camera_file import CameraFile
@@ -67,8 +67,7 @@ def calibrate_camera(
         source=source,
     )
     Undistortion(camera)  # refuses a lens that cannot be undistorted
-    text = yaml.safe_dump(camera.model_dump(mode="json"), sort_keys=False, width=1000)
-    write_atomically(output, text)
+    write_atomically(output, dump_yaml(camera))
     _write_picture(picture, fit, camera, images)
     lines = [
         f"fx {camera.fx:g}, fy {camera.fy:g} ± {100 * fit.focal_sigma:.2f} %, cx {camera.cx:g}, cy {camera.cy:g}, "

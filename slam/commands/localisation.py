@@ -20,9 +20,9 @@ from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.frames import Frame, Image, Intrinsics, Mask, View
 from slam.geometry.multiview import Resection, consensus, pixel_jacobian, resect
 from slam.geometry.robust import mad_sigma, median
-from slam.geometry.se3 import FloatArray, apply, invert, length_of
+from slam.geometry.se3 import FloatArray, Rows, apply, invert, length_of
 from slam.loops.features import FeatureExtractor, hamming
-from slam.loops.places import Places, PlaceStructure, Rows
+from slam.loops.places import Places, PlaceStructure
 from slam.loops.verification import OF_FRAMES, OF_KEYFRAMES, matches
 from slam.loops.vocabulary import PlaceIndex
 from slam.results.folder import RunFolder

@@ -13,10 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.formats.rows import Rows
 from slam.formats.trajectory import translations_and_quaternions
 from slam.frames import Intrinsics
-from slam.geometry.se3 import FloatArray, invert
+from slam.geometry.se3 import FloatArray, Rows, invert
 from slam.runtime.errors import RunError
 from slam.runtime.files import write_atomically
 

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.files import read_text
+from slam.geometry.se3 import Rows
 from slam.runtime.errors import SlamError
 
 logger = logging.getLogger(__name__)
 
-Rows = NDArray[np.intp]  # of a table, by number
 _LEAST_IN_ORDER = 0.75  # share of the rows; with fewer, nobody knows which of them are out of order
 _MOST_PLACES_LATE = 5
 # digits of milli- and microseconds since 1970, and how many are behind the point

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam.formats.rows import BadRows, Rows, in_seconds, is_number, number_or_nan, rows_of
+from slam.formats.rows import BadRows, in_seconds, is_number, number_or_nan, rows_of
 from slam.geometry import se3
 from slam.geometry.robust import median
-from slam.geometry.se3 import FloatArray
+from slam.geometry.se3 import FloatArray, Rows
 from slam.runtime.errors import TrajectoryError
 from slam.runtime.files import write_atomically
 

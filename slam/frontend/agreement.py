@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import erf
 
-from slam.frames import Ends, Intrinsics, RelativePose, runs
+from erfsfm.common.readers.frame_range import runs
+from slam.frames import Ends, Intrinsics, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.measured import named
 from slam.frontend.self_calibration import SURE, FoundCamera, check_camera

@@ -9,7 +9,8 @@ from functools import cached_property
 
 import numpy as np
 
-from slam.frames import Ends, RelativePose, SnippetPoses, TrackingEvent, View, runs
+from erfsfm.common.readers.frame_range import runs
+from slam.frames import Ends, RelativePose, SnippetPoses, TrackingEvent, View
 from slam.frontend.keyframes.relative_poses import NO_MAPS, KeyframePoses
 from slam.frontend.measured import FrontEnd, Keyframe, Measured, named
 from slam.frontend.road import RoadStep

@@ -10,7 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from slam.frames import Ends, RelativePose, SnippetPoses, TrackingEvent, runs
+from erfsfm.common.readers.frame_range import runs
+from slam.frames import Ends, RelativePose, SnippetPoses, TrackingEvent
 from slam.frontend.drive import Drive
 from slam.frontend.keyframes.relative_poses import NO_MAPS, KeyframePoses
 from slam.frontend.measured import Measured

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from erfsfm.common.readers.frame_range import runs
 from slam.frames import (
     DepthMap,
     Ends,
@@ -21,7 +22,6 @@ from slam.frames import (
     TrackingEvent,
     View,
     resized_depth,
-    runs,
 )
 from slam.frontend.followed_corners import CornerRecord, FollowedCorners
 from slam.frontend.keyframes.local_map import LocalMap

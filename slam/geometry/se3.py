@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+Rows = NDArray[np.intp]  # by number
 
 
 def make(R_a_b: FloatArray, t_a_b: FloatArray) -> FloatArray:

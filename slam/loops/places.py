@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from slam.frames import Intrinsics, View
 from slam.geometry.robust import median
-from slam.geometry.se3 import FloatArray, apply, invert
+from slam.geometry.se3 import FloatArray, Rows, apply, invert
 from slam.loops.verification import LoopThresholds, matches
 from slam.loops.vocabulary import joined
 from slam.runtime.errors import RunError
@@ -30,8 +30,6 @@ _LEAST_SIGHTINGS = 3
 _LEAST_ANGLE = np.deg2rad(1.0)  # between two rays of a point
 # of learned depth, median: on streets it is 0.06 to 0.12, in a kitchen 0.4
 _LARGEST_DEPTH_ERROR = 0.2
-
-Rows = NDArray[np.intp]
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.special import fdtri
 
+from erfsfm.common.readers.frame_range import runs
 from erfsfm.evaluation.pose_metrics import (
     SnippetErrors,
     snippet_errors,
@@ -17,7 +18,7 @@ from erfsfm.evaluation.pose_metrics import (
 )
 from slam.evaluation.trajectory import TrajectoryMetrics, trajectory_metrics
 from slam.formats.trajectory import Trajectory
-from slam.frames import RelativePose, runs
+from slam.frames import RelativePose
 from slam.frames import Sequence as FrameSequence
 from slam.frontend.agreement import SHAPE_WITHIN
 from slam.frontend.drive import DOUBLED

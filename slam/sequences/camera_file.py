@@ -19,9 +19,8 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-import yaml
 
-from erfsfm.common.config_tree import parse_yaml
+from erfsfm.common.config_tree import dump_yaml, parse_yaml
 from erfsfm.common.errors import DataError, ErfsfmError
 from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import (
@@ -501,8 +500,7 @@ def write_camera(folder: Path, camera: CameraFile, fixed: Mask | None) -> None:
         image = cv2.imencode(".png", np.uint8(255) * ~fixed)[1].tobytes()
         write_atomically(folder / MASK, image, SequenceError)
         camera = camera.model_copy(update={"mask": MASK})
-    text = yaml.safe_dump(camera.model_dump(mode="json"), sort_keys=False, width=1000)
-    write_atomically(folder / CAMERA_FILE, text, SequenceError)
+    write_atomically(folder / CAMERA_FILE, dump_yaml(camera), SequenceError)
 
 
 def fixed_to(camera: CameraFile, undistortion: Undistortion | None) -> Mask | None:

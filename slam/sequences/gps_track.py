@@ -63,7 +63,8 @@ def read_gps(path: Path) -> GpsTrack:
         raise SequenceError(
             f"{path} holds no GPS fix: CSV with a header {','.join(_NEEDED)} is read"
         )
-    bad, (rows, table) = BadRows(path, SequenceError), map(np.array, zip(*found))
+    bad = BadRows(path, SequenceError)
+    rows, table = map(np.array, zip(*found))
     known = table[:, [0, 1, 2, 4] if np.isnan(table[:, 3]).all() else range(5)]
     is_fix = (
         np.isfinite(known).all(axis=1)

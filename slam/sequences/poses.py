@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from erfsfm.common.files import read_text
+from erfsfm.common.readers.frame_range import runs
 from slam.formats.trajectory import nearest_stamps, other_unit, read_trajectory
-from slam.frames import runs
 from slam.geometry import se3
 from slam.geometry.se3 import BoolArray, FloatArray
 from slam.runtime.errors import SequenceError

@@ -8,7 +8,7 @@ The range is read from the right: a folder may have brackets in its own name.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 
 from erfsfm.common.errors import ConfigError
@@ -87,6 +87,14 @@ def overlapping(names: Iterable[str], seen: Iterable[str]) -> list[str]:
     return found
 
 
+def runs(frames: Collection[int]) -> list[tuple[int, int]]:
+    """Unbroken runs of frame numbers as (first, last)."""
+    known = set(frames)
+    firsts = [k for k in known if k - 1 not in known]
+    lasts = [k for k in known if k + 1 not in known]
+    return list(zip(sorted(firsts), sorted(lasts)))
+
+
 def merge(names: Iterable[str]) -> list[str]:
     """A short, sorted leak record: neighbouring simulated seeds become ranges, duplicates go."""
     seeds: set[int] = set()
@@ -97,9 +105,7 @@ def merge(names: Iterable[str]) -> list[str]:
             others.add(str(FrameRange.parse(name)))
         else:
             seeds |= set(range(span[0], span[1] + 1))
-    firsts = sorted(seed for seed in seeds if seed - 1 not in seeds)
-    lasts = sorted(seed for seed in seeds if seed + 1 not in seeds)
-    ranges = [f"simulated/{a}" if a == b else f"simulated/{a}-{b}" for a, b in zip(firsts, lasts)]
+    ranges = [f"simulated/{a}" if a == b else f"simulated/{a}-{b}" for a, b in runs(seeds)]
     return ranges + sorted(others)
 
 

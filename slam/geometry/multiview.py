@@ -39,6 +39,10 @@ _LEAST_PIXEL_SIGMA = 0.1
 _DAMPING = 1e-13  # of the trace: points hardly in front of the camera leave a matrix that is singular in doubles
 # below this inlier ratio the pose may be one that some wrong tracks agree on
 _DOUBTFUL_RATIO = 0.75
+# of the distance of a camera that stands still or turns on the spot from its place, over the median depth
+_STILL_RATIO = 0.003
+# error of a corner against that distance: four times that of its own, for blurred corners share errors
+_SHARED_PX = 2.0
 _CLEARLY = 2.0  # times the support of the pose by all points, of that by trusted ones in its place
 _SAMPLES = 300
 PIXEL_SIGMA = 0.7  # of a coordinate of a sighting, pixels
@@ -117,6 +121,7 @@ def resect(
     seed: int = 0,
     spread: FloatArray | None = None,
     trusted: BoolArray | None = None,
+    still: FloatArray | None = None,
 ) -> Resection:
     """The pose found from the first guess ``T_camera_world``; in doubt that with most inliers, from others too.
 
@@ -131,11 +136,12 @@ def resect(
         spread: one sigma of each point ``(M, 3)``, in the direction in which it is uncertain; None for exact points.
         trusted: points ``(M,)`` that fitted the last image; where most of them contradict the pose by all points, and
             have one of their own, something passes before the camera, and theirs is taken.
+        still: a place ``(3,)`` in the world from which the camera hardly moved, as in a turn on the spot; None anywhere.
     """
     everything = np.ones(len(points), np.bool_)
-    best = _best(guesses, points, pixels, K, seed, spread, everything)
+    best = _best(guesses, points, pixels, K, seed, spread, everything, still)
     if trusted is not None and _support(best, trusted) < _DOUBTFUL_RATIO * trusted.sum():
-        by_trusted = _best(guesses, points, pixels, K, seed, spread, trusted)
+        by_trusted = _best(guesses, points, pixels, K, seed, spread, trusted, still)
         best = (
             by_trusted
             if _support(by_trusted, trusted) > _CLEARLY * _support(best, trusted)
@@ -156,6 +162,7 @@ def _best(
     seed: int,
     spread: FloatArray | None,
     votes: BoolArray,
+    still: FloatArray | None,
 ) -> Resection:
     """The pose by the points that vote ``(M,)``: the first one that most of them fit, or that which most fit."""
 
@@ -167,7 +174,7 @@ def _best(
 
     found: list[Resection] = []
     for start in starts():
-        found.append(_refined(start, points, spread, pixels, K, votes))
+        found.append(_refined(start, points, spread, pixels, K, votes, still))
         if _support(found[-1], votes) >= _DOUBTFUL_RATIO * votes.sum():
             return found[-1]
     return max(found, key=lambda pose: _support(pose, votes))
@@ -180,12 +187,16 @@ def _refined(
     pixels: FloatArray,
     K: FloatArray,
     votes: BoolArray,
+    still: FloatArray | None,
 ) -> Resection:
     """Cauchy weights of half an inlier; far from the solution, where all residuals are large, of their median."""
     T = T_camera_world.copy()
     focal = np.array([K[0, 0], K[1, 1]])
     rays = (pixels - K[:2, 2]) / focal
     residual, J, X = _whitened(T, points, spread, rays, focal)
+    place, pull = np.zeros(3), 0.0
+    if still is not None:
+        place, pull = still, (_SHARED_PX / (_STILL_RATIO * median(X[:, 2]))) ** 2
     for _ in range(_ITERATIONS):
         norm = np.hypot(*residual)
         scale = max(0.5 * INLIER_PX, median(norm[votes]))
@@ -193,7 +204,10 @@ def _refined(
         weighted = (weight * J).reshape(6, -1)
         information = weighted @ J.reshape(6, -1).T
         information += (1e-9 + _DAMPING * np.trace(information)) * np.eye(6)
-        step = np.asarray(np.linalg.solve(information, -weighted @ residual.ravel()), np.float64)
+        information[3:, 3:] += pull * np.eye(3)
+        gradient = weighted @ residual.ravel()
+        gradient[3:] += pull * (T[:3, :3] @ place + T[:3, 3])
+        step = np.asarray(np.linalg.solve(information, -gradient), np.float64)
         T = compose(make(rotation_matrix(step[:3]), step[3:]), T)
         residual, J, X = _whitened(T, points, spread, rays, focal)
         if np.abs(step).max() < _CONVERGED:

@@ -269,16 +269,19 @@ class KeyframeOdometry:
         """The camera's pose from known points; whether enough fit, most of them unless the frame ``is_doubtful``."""
         known = segment.known(track_ids)
         places, pixels = pixels, in_middle_row(pixels, self._turn_rate, self._intrinsics)
-        pose = self._resected(segment, track_ids[known], pixels[known])
+        tracked, last = (track_ids[known], pixels[known]), segment.keyframes[-1]
+        settled = segment.parallax(segment.keyframes[-_LOOKED_BACK:]).settled[track_ids]
+        is_settled = settled.sum() >= MIN_POINTS
+        is_still = not is_settled and (last.is_turn or is_doubtful)
+        pose = self._resected(segment, *tracked, is_still)
         if pose is None:
             return False
-        is_settled = self._parallax(segment).settled[track_ids].sum() >= MIN_POINTS
         residual_px = median(pose.residual_px)
         fits = pose.residual_px < (INLIER_PX if is_settled else _DOUBTFUL_PX)
         if not is_doubtful and fits.mean() < 0.5:
             return False
         self._lost, T_before = 0, self._T_camera_world
-        last, intrinsics = segment.keyframes[-1], self._intrinsics
+        intrinsics = self._intrinsics
         slipped = track_ids[known][pose.residual_px > _SLIPPED * INLIER_PX]
         self._slipped |= np.isin(last.track_ids, slipped)
         kept = ~np.isin(track_ids, slipped)
@@ -298,12 +301,13 @@ class KeyframeOdometry:
             by_turn = _apart(turned(first, R, intrinsics), pixels)
             most = min(_TURN_RATIO * residual_px, INLIER_PX)
             is_turn = residual_px > _NOISE_PX and by_turn < most
-            if is_turn:  # needs no depth
-                self._T_camera_world = make(R, np.zeros(3)) @ last.T_camera_world
-            elif parallax > _DOUBTFUL_PARALLAX_RATIO:
-                settled = segment.parallax(segment.keyframes[-_LOOKED_BACK:]).settled[track_ids]
-                if is_doubtful or settled.sum() < MIN_POINTS:
-                    self._check_first_motion(segment, track_ids, first, seen)
+            if is_turn and not is_still:
+                pose = self._resected(segment, *tracked, True) or pose
+                self._T_camera_world = pose.T_camera_world
+            is_large = parallax > _DOUBTFUL_PARALLAX_RATIO
+            is_turn |= last.is_turn and not is_settled and not is_large
+            if is_large and not is_turn and (is_doubtful or not is_settled):
+                self._check_first_motion(segment, track_ids, first, seen)
             self._add_keyframe(segment, frame, track_ids, places, is_turn)
         self._keep(frame, track_ids, pixels)
         return True
@@ -319,7 +323,9 @@ class KeyframeOdometry:
             self._known_parallax = segment.recent_parallax()
         return self._known_parallax
 
-    def _resected(self, segment: LocalMap, track_ids: TrackIds, pixels: Pixels) -> Resection | None:
+    def _resected(
+        self, segment: LocalMap, track_ids: TrackIds, pixels: Pixels, is_still: bool
+    ) -> Resection | None:
         """From the last pose and from the predicted one; None with too few inliers."""
         if len(track_ids) < MIN_POINTS:
             return None
@@ -337,6 +343,7 @@ class KeyframeOdometry:
             self._seed,
             spread,
             trusted,
+            invert(segment.keyframes[-1].T_camera_world)[:3, 3] if is_still else None,
         )
         return pose if len(pose.inliers) >= MIN_POINTS else None
 

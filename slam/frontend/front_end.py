@@ -24,6 +24,8 @@ from slam.runtime.stopwatch import Stopwatch
 _FRAMES, _KEYFRAMES = 40, 20
 # triangulated steps after which auto decides, if it is clear, or however that is
 _CLEAR_STEPS, _MOST_STEPS = 10, 30
+# least share of images that see a road: 0.6 to 1 of drives, 0.2 of a camera that turns in a room
+_ROAD_SHARE = 1.0 / 3.0
 _VEHICLE_SCATTER_DEG = 10.0  # median angle of a vehicle's steps to their usual direction, degrees
 # of a camera that is carried: a vehicle's first steps scatter by 2 degrees
 _CLEAR_SCATTER_DEG = 5.0
@@ -179,7 +181,8 @@ def choose(
 def _is_on_vehicle(measured: Measured) -> bool | None:
     """Whether the first triangulated steps all go the same way, as seen from the camera, at the speed of a vehicle.
 
-    None while they are few. Without a road nothing has the speed of a vehicle; a vehicle that starts is slow.
+    None while they are few. Without a road in many images nothing has the speed of a vehicle; a vehicle that starts is
+    slow.
     """
     first = list(
         islice(
@@ -190,7 +193,8 @@ def _is_on_vehicle(measured: Measured) -> bool | None:
         return None
     heights = [road for road in measured.roads if road is not None]
     speeds = [motion.length_unscaled / motion.seconds for motion in first]
-    is_fast = bool(heights) and bool(np.median(speeds) >= _VEHICLE_SPEED * np.median(heights))
+    is_on_road = len(heights) > _ROAD_SHARE * len(measured.roads)
+    is_fast = is_on_road and bool(np.median(speeds) >= _VEHICLE_SPEED * np.median(heights))
     steps = np.array([motion.relative_pose.T_from_to[:3, 3] for motion in first])
     directions = normalised(steps)
     usual = np.median(directions, axis=0)

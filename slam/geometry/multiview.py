@@ -136,48 +136,34 @@ def resect(
         spread: one sigma of each point ``(M, 3)``, in the direction in which it is uncertain; None for exact points.
         trusted: points ``(M,)`` that fitted the last image; where most of them contradict the pose by all points, and
             have one of their own, something passes before the camera, and theirs is taken.
-        still: a place ``(3,)`` in the world from which the camera hardly moved, as in a turn on the spot; None anywhere.
+        still: place ``(3,)`` from which the camera hardly moved, as in a turn on the spot; None for none.
     """
-    everything = np.ones(len(points), np.bool_)
-    best = _best(guesses, points, pixels, K, seed, spread, everything, still)
-    if trusted is not None and _support(best, trusted) < _DOUBTFUL_RATIO * trusted.sum():
-        by_trusted = _best(guesses, points, pixels, K, seed, spread, trusted, still)
-        best = (
-            by_trusted
-            if _support(by_trusted, trusted) > _CLEARLY * _support(best, trusted)
-            else best
-        )
-    return best
 
+    def best(votes: BoolArray) -> Resection:
+        """The pose by the points that vote ``(M,)``: the first one that most of them fit, or that which most fit."""
+        found: list[Resection] = []
+        for start in starts(votes):
+            found.append(_refined(start, points, spread, pixels, K, votes, still))
+            if _support(found[-1], votes) >= _DOUBTFUL_RATIO * votes.sum():
+                return found[-1]
+        return max(found, key=lambda pose: _support(pose, votes))
 
-def _support(pose: Resection, votes: BoolArray) -> int:
-    return int((pose.residual_px[votes] < INLIER_PX).sum())
-
-
-def _best(
-    guesses: Sequence[FloatArray],
-    points: FloatArray,
-    pixels: FloatArray,
-    K: FloatArray,
-    seed: int,
-    spread: FloatArray | None,
-    votes: BoolArray,
-    still: FloatArray | None,
-) -> Resection:
-    """The pose by the points that vote ``(M,)``: the first one that most of them fit, or that which most fit."""
-
-    def starts() -> Iterator[FloatArray]:
+    def starts(votes: BoolArray) -> Iterator[FloatArray]:
         yield from guesses
         start, inliers = consensus(points[votes], pixels[votes], K, _SAMPLES, INLIER_PX, seed)
         if len(inliers):
             yield start
 
-    found: list[Resection] = []
-    for start in starts():
-        found.append(_refined(start, points, spread, pixels, K, votes, still))
-        if _support(found[-1], votes) >= _DOUBTFUL_RATIO * votes.sum():
-            return found[-1]
-    return max(found, key=lambda pose: _support(pose, votes))
+    pose = best(np.ones(len(points), np.bool_))
+    if trusted is not None and _support(pose, trusted) < _DOUBTFUL_RATIO * trusted.sum():
+        by_trusted = best(trusted)
+        if _support(by_trusted, trusted) > _CLEARLY * _support(pose, trusted):
+            return by_trusted
+    return pose
+
+
+def _support(pose: Resection, votes: BoolArray) -> int:
+    return int((pose.residual_px[votes] < INLIER_PX).sum())
 
 
 def _refined(

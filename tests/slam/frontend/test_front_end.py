@@ -65,7 +65,7 @@ def test_a_vehicle_goes_the_same_way_for_a_while_and_fast(
 ):
     drive = steps(count, scatter, seconds)
     assert choose(KeyframesConfig(), None, drive) is front_end
-    drive.roads[:] = [None] * count
+    drive.roads[:] = [None if k % 4 else 1.0 for k in range(count)]
     assert choose(KeyframesConfig(), None, drive) is not FrontEnd.STEPS
 
 

@@ -180,6 +180,20 @@ def test_points_of_uncertain_depth_give_the_turn_and_only_the_direction_of_a_ste
     assert np.median(known.residual_px) < 0.5 * np.median(exact.residual_px)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_in_front_of_a_wall_errors_are_no_step_of_a_camera_that_turns_where_it_stood(seed: int):
+    rng = np.random.default_rng(seed)
+    wall = rng.uniform((-1.2, -0.8, 1.9), (1.2, 0.8, 2.1), (100, 3))
+    T_true = from_rotation_vector(np.array([0.01, 0.1, 0.0]), np.zeros(3))
+    pixels = INTRINSICS.project(apply(T_true, wall)) + rng.normal(0.0, 1.0, (100, 2))
+    errors = [
+        T_true @ invert(resect((T_true,), wall, pixels, INTRINSICS.K, still=place).T_camera_world)
+        for place in (None, np.zeros(3))
+    ]
+    free, still = (rotation_angle(T[:3, :3]) for T in errors)
+    assert still < 0.5 * free
+
+
 def test_the_majority_is_not_the_world_where_others_have_the_vote():
     points, pixels = seen(200)
     trusted = np.arange(200) < 50

@@ -69,6 +69,8 @@ _LAST_FRAMES = 4  # frames in which a pose is looked up
 # median parallax that asks for a keyframe, over the image width; in a map of few keyframes
 _PARALLAX_RATIO = 0.03
 _YOUNG_PARALLAX_RATIO = 0.0125
+# that no camera has at once after a turn on the spot: slipped tracks agree on it
+_LEAP_RATIO = 0.06
 _YOUNG_KEYFRAMES = 4
 _LOOKED_BACK = 4  # keyframes between which points have parallax before a first motion
 # from which on a first motion is doubted: a reversed one takes most of the flow for a turn
@@ -272,7 +274,7 @@ class KeyframeOdometry:
         tracked, last = (track_ids[known], pixels[known]), segment.keyframes[-1]
         settled = segment.parallax(segment.keyframes[-_LOOKED_BACK:]).settled[track_ids]
         is_settled = settled.sum() >= MIN_POINTS
-        is_still = not is_settled and (last.is_turn or is_doubtful)
+        is_still = not is_settled and is_doubtful
         pose = self._resected(segment, *tracked, is_still)
         if pose is None:
             return False
@@ -301,12 +303,13 @@ class KeyframeOdometry:
             by_turn = _apart(turned(first, R, intrinsics), pixels)
             most = min(_TURN_RATIO * residual_px, INLIER_PX)
             is_turn = residual_px > _NOISE_PX and by_turn < most
-            if is_turn and not is_still:
-                pose = self._resected(segment, *tracked, True) or pose
-                self._T_camera_world = pose.T_camera_world
-            is_large = parallax > _DOUBTFUL_PARALLAX_RATIO
-            is_turn |= last.is_turn and not is_settled and not is_large
-            if is_large and not is_turn and (is_doubtful or not is_settled):
+            leaps, moves = parallax > _LEAP_RATIO, parallax > _DOUBTFUL_PARALLAX_RATIO
+            is_turn |= last.is_turn and not is_settled and (leaps or not moves)
+            if is_turn and (leaps or not is_still):
+                self._T_camera_world = make(R, np.zeros(3)) @ last.T_camera_world
+                pose = self._resected(segment, *tracked, True)
+                self._T_camera_world = pose.T_camera_world if pose else self._T_camera_world
+            if moves and not is_turn and (is_doubtful or not is_settled):
                 self._check_first_motion(segment, track_ids, first, seen)
             self._add_keyframe(segment, frame, track_ids, places, is_turn)
         self._keep(frame, track_ids, pixels)

@@ -306,9 +306,10 @@ class KeyframeOdometry:
             leaps, moves = parallax > _LEAP_RATIO, parallax > _DOUBTFUL_PARALLAX_RATIO
             is_turn |= last.is_turn and not is_settled and (leaps or not moves)
             if is_turn and (leaps or not is_still):
-                self._T_camera_world = make(R, np.zeros(3)) @ last.T_camera_world
-                pose = self._resected(segment, *tracked, True)
-                self._T_camera_world = pose.T_camera_world if pose else self._T_camera_world
+                self._T_camera_world = T_before
+                held = self._resected(segment, *tracked, True)
+                is_turn = held is not None
+                self._T_camera_world = (held or pose).T_camera_world
             if moves and not is_turn and (is_doubtful or not is_settled):
                 self._check_first_motion(segment, track_ids, first, seen)
             self._add_keyframe(segment, frame, track_ids, places, is_turn)

@@ -41,7 +41,7 @@ _DAMPING = 1e-13  # of the trace: points hardly in front of the camera leave a m
 _DOUBTFUL_RATIO = 0.75
 # of the distance of a camera that stands still or turns on the spot from its place, over the median depth
 _STILL_RATIO = 0.003
-# error of a corner against that distance: four times that of its own, for blurred corners share errors
+# of a corner against that distance: blurred corners share errors
 _SHARED_PX = 2.0
 _CLEARLY = 2.0  # times the support of the pose by all points, of that by trusted ones in its place
 _SAMPLES = 300

@@ -109,7 +109,7 @@ class TrackedKeyframe:
     ``places`` ``(M, 2)`` are where its image has them: with a rolling shutter, pixels are as of the
     middle row. ``learned_depth`` ``(M,)`` is positive, NaN where unknown, ``descriptors`` are
     ``(M, 32)``; ``grey`` is None once the image is not kept any more. After a turn on the spot
-    (``is_turn``) corners say nothing of where the camera is.
+    (``is_turn``) corners hardly say where the camera is.
     """
 
     index: int

@@ -121,6 +121,7 @@ class KeyframeOdometry:
         self.events: list[TrackingEvent] = []
         # of the points of the last keyframe, once it is asked for
         self._known_parallax: Parallax | None = None
+        self._settled: NDArray[np.bool_] | None = None  # points, by the last keyframes
         self._relocalises = relocalises
         self._relocaliser: Relocaliser | None = None  # of the lost map
 
@@ -218,7 +219,7 @@ class KeyframeOdometry:
         if segment.keyframes[-1].index != frame.index:
             return
         segment.keyframes[-1] = segment.keyframes[-1].with_depth(depth)
-        self._known_parallax = segment.add_points(self._intrinsics)
+        self._known_parallax, self._settled = segment.add_points(self._intrinsics), None
         points = int(segment.known(segment.keyframes[-1].track_ids).sum())
         if not segment.started and points >= MIN_POINTS:
             segment.started = True
@@ -272,8 +273,9 @@ class KeyframeOdometry:
         known = segment.known(track_ids)
         places, pixels = pixels, in_middle_row(pixels, self._turn_rate, self._intrinsics)
         tracked, last = (track_ids[known], pixels[known]), segment.keyframes[-1]
-        settled = segment.parallax(segment.keyframes[-_LOOKED_BACK:]).settled[track_ids]
-        is_settled = settled.sum() >= MIN_POINTS
+        if self._settled is None:
+            self._settled = segment.parallax(segment.keyframes[-_LOOKED_BACK:]).settled
+        is_settled = self._settled[track_ids].sum() >= MIN_POINTS
         is_still = not is_settled and is_doubtful
         pose = self._resected(segment, *tracked, is_still)
         if pose is None:
@@ -400,7 +402,7 @@ class KeyframeOdometry:
             self._T_camera_world = segment.keyframes[-1].T_camera_world
         self._places = segment.keyframes[-1].places.astype(np.float32)
         self._slipped = np.zeros(len(self._places), np.bool_)
-        self._known_parallax = None
+        self._known_parallax = self._settled = None
 
     def _note(
         self, frame: int, event: Event, other: int | None = None, support: int | None = None

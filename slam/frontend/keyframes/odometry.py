@@ -69,8 +69,6 @@ _LAST_FRAMES = 4  # frames in which a pose is looked up
 # median parallax that asks for a keyframe, over the image width; in a map of few keyframes
 _PARALLAX_RATIO = 0.03
 _YOUNG_PARALLAX_RATIO = 0.0125
-# that no camera has at once after a turn on the spot: slipped tracks agree on it
-_LEAP_RATIO = 0.06
 _YOUNG_KEYFRAMES = 4
 _LOOKED_BACK = 4  # keyframes between which points have parallax before a first motion
 # from which on a first motion is doubted: a reversed one takes most of the flow for a turn
@@ -82,6 +80,9 @@ _DOUBTFUL_PX = 0.5 * INLIER_PX
 # noise: blurred corners always agree on some translation (on the spot mostly 0.4 to 1.3, of a walk
 # 1.5 and more)
 _TURN_RATIO, _NOISE_PX = 1.3, 0.5
+# of the median residual at the place of a turn over that of a free pose, by dense flow, where the
+# turn has ended (on the spot up to 1.7, of a walk soon 2 and more)
+_END_RATIO = 1.7
 _NOTHING: tuple[TrackIds, Pixels] = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
 
 
@@ -276,10 +277,14 @@ class KeyframeOdometry:
         if self._settled is None:
             self._settled = segment.parallax(segment.keyframes[-_LOOKED_BACK:]).settled
         is_settled = self._settled[track_ids].sum() >= MIN_POINTS
-        is_still = not is_settled and is_doubtful
+        is_still = not is_settled and (last.is_turn or is_doubtful)
         pose = self._resected(segment, *tracked, is_still)
         if pose is None:
             return False
+        if is_still and last.is_turn and is_doubtful:
+            free = self._resected(segment, *tracked, False)
+            if free and median(pose.residual_px) > _END_RATIO * median(free.residual_px):
+                pose, is_still = free, False
         residual_px = median(pose.residual_px)
         fits = pose.residual_px < (INLIER_PX if is_settled else _DOUBTFUL_PX)
         if not is_doubtful and fits.mean() < 0.5:
@@ -305,13 +310,12 @@ class KeyframeOdometry:
             by_turn = _apart(turned(first, R, intrinsics), pixels)
             most = min(_TURN_RATIO * residual_px, INLIER_PX)
             is_turn = residual_px > _NOISE_PX and by_turn < most
-            leaps, moves = parallax > _LEAP_RATIO, parallax > _DOUBTFUL_PARALLAX_RATIO
-            is_turn |= last.is_turn and not is_settled and (leaps or not moves)
-            if is_turn and (leaps or not is_still):
+            if is_turn and not is_still:
                 self._T_camera_world = T_before
                 held = self._resected(segment, *tracked, True)
                 is_turn = held is not None
                 self._T_camera_world = (held or pose).T_camera_world
+            moves = parallax > _DOUBTFUL_PARALLAX_RATIO
             if moves and not is_turn and (is_doubtful or not is_settled):
                 self._check_first_motion(segment, track_ids, first, seen)
             self._add_keyframe(segment, frame, track_ids, places, is_turn)

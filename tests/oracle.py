@@ -11,8 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import DepthMap, Frame, SnippetPoses
 from slam.geometry.se3 import FloatArray, from_rotation_vector, invert
+from slam.pipeline.estimate import Estimate
 from slam.runtime.errors import SlamError
 
 _NOISE_CELL_PX = 32
@@ -116,3 +118,8 @@ def snippets_of(
             T_source_target = invert(T_world_camera[around]) @ T_world_camera[target]
             found.append(SnippetPoses(target, tuple(around), T_source_target))
     return found
+
+
+def ate(result: Estimate, name: str = "optimised") -> float:
+    """7-dof, of one of its trajectories, metres."""
+    return float(trajectory_metrics(getattr(result, name), result.reference).align.dof7.ate_rmse_m)

@@ -8,10 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from oracle import OracleNoise, OraclePredictor
+from oracle import OracleNoise, OraclePredictor, ate
 
 from slam.config.sections import LoopsConfig, load_config
-from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose, View
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert, rotation_angle
 from slam.loops.closure import MOST_REJECTED, Apart, Track, agreeing, close_loops, find_candidates
@@ -75,10 +74,6 @@ def is_false(loop: Loop, T_true: FloatArray) -> bool:
     )
 
 
-def ate(result: Estimate, name: str) -> float:
-    return float(trajectory_metrics(getattr(result, name), result.reference).align.dof7.ate_rmse_m)
-
-
 @functools.cache
 def closed(seed: int) -> tuple[Drive, Estimate]:
     sequence = Drive("loop", 125, seed)
@@ -91,7 +86,7 @@ def test_a_loop_is_closed_and_cuts_the_error(seed: int):
     accepted = result.loops.accepted
     assert len(accepted) >= 5
     assert not any(is_false(loop, sequence.reference) for loop in accepted)
-    assert ate(result, "optimised") < 0.6 * ate(result, "odometry")
+    assert ate(result) < 0.6 * ate(result, "odometry")
     details = json.loads(json.dumps(result.loops.details()))
     assert (
         result.loops.candidates

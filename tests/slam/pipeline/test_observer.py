@@ -12,10 +12,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from oracle import OracleNoise, OraclePredictor
+from oracle import OracleNoise, OraclePredictor, ate
 
 from slam.config.sections import SlamConfig, load_config
-from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import Frame
 from slam.frontend import tracking
 from slam.frontend.gaps import INTERPOLATED_SOURCE
@@ -142,10 +141,6 @@ def run_on(damage: Damage) -> tuple[Estimate, str]:
         return run(damage, BAD, f"mapping.enabled={str(damage is black).lower()}"), "\n".join(lines)
     finally:
         logger.removeHandler(listing)
-
-
-def ate(result: Estimate) -> float:
-    return float(trajectory_metrics(result.optimised, result.reference).align.dof7.ate_rmse_m)
 
 
 @pytest.mark.parametrize(

@@ -13,12 +13,11 @@ import cv2
 import numpy as np
 import pytest
 import room
-from oracle import OracleNoise, OraclePredictor
+from oracle import OracleNoise, OraclePredictor, ate
 
 from erfsfm.common.errors import SHOW_TRACEBACK
 from erfsfm.common.progress import Progress, silent
 from slam.config.sections import load_config
-from slam.evaluation.trajectory import trajectory_metrics
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.frames import Frame, GpsTrack, Image, Intrinsics, SnippetPoses
 from slam.frontend import measured
@@ -116,10 +115,6 @@ def run(
     return SlamPipeline(drive, oracle, load_config(None, [*NO_IMAGES, *overrides])).run()
 
 
-def ate(estimate: Trajectory, reference: Trajectory | None) -> float:
-    return float(trajectory_metrics(estimate, reference).align.dof7.ate_rmse_m)
-
-
 def test_exact_predictions_give_the_true_trajectory():
     drive = LevelRoad(turning(60))
     result = run(drive)
@@ -154,7 +149,7 @@ def test_a_pose_that_is_no_number_costs_a_gap():
     result = SlamPipeline(drive, oracle, load_config(None, NO_IMAGES)).run()
     snippets = result.drive.measured.snippets
     assert [sources[0] for sources in snippets] == [*range(18), *range(19, 56)]
-    assert ate(result.optimised, result.reference) < 0.1
+    assert ate(result) < 0.1
 
 
 def test_a_step_that_no_camera_makes_begins_a_segment(monkeypatch: pytest.MonkeyPatch):
@@ -196,7 +191,7 @@ def test_an_error_in_loops_or_graph_costs_these(stage: str, monkeypatch: pytest.
         and "KeyError: 7 (test_run.py:" in result.loops.not_sought
     )
     assert isinstance(result.graph, Failed) == (stage == "PoseGraph")
-    assert ate(result.optimised, result.reference) < 1e-3
+    assert ate(result) < 1e-3
     monkeypatch.setenv(SHOW_TRACEBACK, "1")
     with pytest.raises(KeyError):
         pipeline.run()
@@ -208,7 +203,7 @@ def test_scale_drift_is_corrected_by_the_ground_plane():
     drifted = result.network.length_m / FACTOR / turning_length(120)
     assert abs(np.log(drifted)) > 0.1
     assert result.optimised.length_m == pytest.approx(turning_length(120), rel=0.03)
-    assert ate(result.optimised, result.reference) < 0.3 * ate(result.network, result.reference)
+    assert ate(result) < 0.3 * ate(result, "network")
 
 
 def turning_length(frames: int) -> float:

@@ -279,12 +279,12 @@ class KeyframeOdometry:
         is_settled = self._settled[track_ids].sum() >= MIN_POINTS
         is_still = not is_settled and (last.is_turn or is_doubtful)
         pose = self._resected(segment, *tracked, is_still)
-        if pose is None:
-            return False
-        if is_still and last.is_turn and is_doubtful:
+        if pose and is_still and last.is_turn and is_doubtful:
             free = self._resected(segment, *tracked, False)
             if free and median(pose.residual_px) > _END_RATIO * median(free.residual_px):
-                pose, is_still = free, False
+                pose, is_still = free, False  # the turn has ended
+        if pose is None:
+            return False
         residual_px = median(pose.residual_px)
         fits = pose.residual_px < (INLIER_PX if is_settled else _DOUBTFUL_PX)
         if not is_doubtful and fits.mean() < 0.5:
@@ -306,10 +306,7 @@ class KeyframeOdometry:
         are_few = len(track_ids) < max(_KEYFRAME_TRACKS_RATIO * len(last.track_ids), MIN_POINTS)
         if are_few or parallax > limit or flow > _MOST_FLOW * limit:
             seen = pixels.astype(np.float64)
-            R = rotation_between(intrinsics.rays(first), intrinsics.rays(seen))
-            by_turn = _apart(turned(first, R, intrinsics), pixels)
-            most = min(_TURN_RATIO * residual_px, INLIER_PX)
-            is_turn = residual_px > _NOISE_PX and by_turn < most
+            is_turn = residual_px > _NOISE_PX and self._turns(first, seen, residual_px)
             if is_turn and not is_still:
                 self._T_camera_world = T_before
                 held = self._resected(segment, *tracked, True)
@@ -321,6 +318,12 @@ class KeyframeOdometry:
             self._add_keyframe(segment, frame, track_ids, places, is_turn)
         self._keep(frame, track_ids, pixels)
         return True
+
+    def _turns(self, first: FloatArray, now: FloatArray, residual_px: float) -> bool:
+        """Whether a turn moves corners ``first`` ``(M, 2)`` to where they are ``now``, hardly worse than the pose."""
+        R = rotation_between(self._intrinsics.rays(first), self._intrinsics.rays(now))
+        by_turn_px = _apart(turned(first, R, self._intrinsics), now)
+        return by_turn_px < min(_TURN_RATIO * residual_px, INLIER_PX)
 
     def _keep(self, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
         """Keep a frame at the present pose, relative to the newest keyframe."""
@@ -416,6 +419,6 @@ class KeyframeOdometry:
         logger.info("%s", self.events[-1])
 
 
-def _apart(first: Pixels | FloatArray, second: Pixels) -> float:
+def _apart(first: Pixels | FloatArray, second: Pixels | FloatArray) -> float:
     """The median distance of pixels ``(M, 2)``."""
     return median(np.linalg.norm(first - second, axis=1))

@@ -175,7 +175,10 @@ def _refined(
     votes: BoolArray,
     still: FloatArray | None,
 ) -> Resection:
-    """Cauchy weights of half an inlier; far from the solution, where all residuals are large, of their median."""
+    """Cauchy weights of half an inlier; far from the solution, where all residuals are large, of their median.
+
+    The prior of the place ``still`` is Gaussian: its sigma is a share of the median depth at the start.
+    """
     T = T_camera_world.copy()
     focal = np.array([K[0, 0], K[1, 1]])
     rays = (pixels - K[:2, 2]) / focal

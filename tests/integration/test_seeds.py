@@ -21,7 +21,7 @@ MOST_SPREAD = 1.5  # of the worst seed over the mean: more is a fault, however g
 
 
 def ate_m(run: RunFolder) -> float:
-    return run.metrics().tree()["trajectories"]["optimised"]["align"]["7dof"]["ate_rmse_m"]
+    return run.metrics().trajectories.optimised.align.dof7.ate_rmse_m
 
 
 def run_in_rooms(folder: Path, world: SimulatedRooms) -> RunFolder:

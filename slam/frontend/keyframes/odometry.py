@@ -70,7 +70,8 @@ _LAST_FRAMES = 4  # frames in which a pose is looked up
 _PARALLAX_RATIO = 0.03
 _YOUNG_PARALLAX_RATIO = 0.0125
 _YOUNG_KEYFRAMES = 4
-_LOOKED_BACK = 4  # keyframes between which points have parallax before a first motion
+# keyframes between which points have parallax; without it a turn may go on, and a first motion be wrong
+_LOOKED_BACK = 4
 # from which on a first motion is doubted: a reversed one takes most of the flow for a turn
 _DOUBTFUL_PARALLAX_RATIO = 0.005
 _MAX_CORNERS = 500  # of a keyframe
@@ -339,7 +340,7 @@ class KeyframeOdometry:
     def _resected(
         self, segment: LocalMap, track_ids: TrackIds, pixels: Pixels, is_still: bool
     ) -> Resection | None:
-        """From the last pose and from the predicted one; None with too few inliers."""
+        """From the last and the predicted pose, at the last keyframe's place if ``is_still``; None with few inliers."""
         if len(track_ids) < MIN_POINTS:
             return None
         T_last = self._T_camera_world
